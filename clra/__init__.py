@@ -1,0 +1,40 @@
+"""Motion correction for cone-beam X-ray micro-CT: re-projection alignment on any OpenCL device.
+
+The public names are handed on lazily (PEP 562), so that ``import clra`` is quick and touches no
+OpenCL; each lives in the module that the table below names.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    "ConeBeamGeometry": "clra.model.geometry",
+    "circular": "clra.model.trajectory",
+    "helix": "clra.model.trajectory",
+    "double_helix": "clra.model.trajectory",
+    "space_filling": "clra.model.trajectory",
+    "VolumeGrid": "clra.model.grid",
+    "Motion": "clra.model.motion",
+    "Scan": "clra.model.scan",
+    "read_scan": "clra.io.scans",
+    "align": "clra.methods.alignment",
+    "reconstruct": "clra.methods.reconstruction",
+    "correct": "clra.methods.correction",
+    "devices": "clra.ops.opencl",
+    "ForwardProjector": "clra.ops.projector",
+    "BackProjector": "clra.ops.projector",
+}
+
+__all__ = ["kernels", *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "kernels":
+        return import_module("clra.kernels")
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'clra' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Immutable values in millimetres and pixels: geometry, motion, grid, scan, phantom; numpy only."""

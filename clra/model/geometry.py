@@ -1,0 +1,314 @@
+"""The acquisition geometry: where source and panel stood in each view."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from clra.model.motion import Motion
+
+Floats = NDArray[np.float64]
+
+# Ratios of lengths below which a panel counts as degenerate: float64 rounding leaves 1e-16, and no
+# scanner has an angle of 1e-9 between its rows and columns.
+_DEGENERATE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class ConeBeamGeometry:
+    """Source and panel of every view, in a right-handed frame fixed to the sample.
+
+    The z axis is the rotation axis. The centre of pixel (row j, column i) of a view is
+    ``detector + (i - (columns - 1) / 2) u + (j - (rows - 1) / 2) v``; these are the numbers of
+    ASTRA's ``cone_vec``. Values are checked and copied; the arrays are read-only.
+
+    Parameters
+    ----------
+    source : array_like, (views, 3)
+        Position (x, y, z) of the source [mm].
+    detector : array_like, (views, 3)
+        Position of the panel's centre [mm].
+    u, v : array_like, (views, 3)
+        Step from one column, and from one row, to the next [mm].
+    shape : (int, int)
+        Rows and columns of the panel.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a number is not finite, ``u`` and ``v`` are parallel, or the source
+        lies in the panel's plane.
+    """
+
+    source: Floats
+    detector: Floats
+    u: Floats
+    v: Floats
+    shape: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape", _panel_shape(self.shape))
+        for name in ("source", "detector", "u", "v"):
+            object.__setattr__(self, name, _vectors(name, getattr(self, name)))
+        for name in ("detector", "u", "v"):
+            found = len(getattr(self, name))
+            if found != self.views:
+                raise ValueError(
+                    f"{name}: found {found} views, expected {self.views} as in source"
+                )
+        u, v = _norm(self.u), _norm(self.v)
+        area = _norm(np.cross(self.u, self.v))
+        _refuse(area <= _DEGENERATE * u * v, "u and v: parallel or zero", "two directions")
+        reach = _norm(self.detector - self.source) + self.columns * u + self.rows * v
+        depth = np.abs(_dot(np.cross(self.u, self.v), self.detector - self.source)) / area
+        _refuse(depth <= _DEGENERATE * reach, "source: in the panel's plane", "one off the plane")
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return len(self.source)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the panel."""
+        return self.shape[0]
+
+    @property
+    def columns(self) -> int:
+        """Columns of the panel."""
+        return self.shape[1]
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return self.views
+
+    def __eq__(self, other: object) -> bool:
+        """Compare exactly, number by number."""
+        if not isinstance(other, ConeBeamGeometry):
+            return NotImplemented
+        return self.shape == other.shape and np.array_equal(self.to_astra(), other.to_astra())
+
+    def __repr__(self) -> str:
+        """Summarise views, panel, distances and travel."""
+        z = self.source[:, 2]
+        pixel = f"{np.median(_norm(self.u)):.4g} x {np.median(_norm(self.v)):.4g}"
+        return (
+            f"ConeBeamGeometry({self.views} views of {self.rows} x {self.columns} pixels, "
+            f"pixel {pixel} mm, source to axis {np.median(self.source_to_axis):.4g} mm, "
+            f"to detector {np.median(self.source_to_detector):.4g} mm, "
+            f"source z {z.min():.4g} to {z.max():.4g} mm)"
+        )
+
+    @property
+    def axial(self) -> bool:
+        """Whether the rows are stacked along z in every view, so that the fast kernels apply."""
+        return bool(np.all(np.abs(self.v[:, :2]) <= 1e-9 * _norm(self.v)[:, None]))
+
+    @property
+    def normal(self) -> Floats:
+        """Unit normal of the panel that points away from the source, (views, 3)."""
+        normal = np.cross(self.u, self.v)
+        away = np.sign(_dot(normal, self.detector - self.source))
+        return np.asarray(normal * (away / _norm(normal))[:, None])
+
+    @property
+    def source_to_detector(self) -> Floats:
+        """Distance from the source to the panel's plane, (views,) [mm]."""
+        return _dot(self.normal, self.detector - self.source)
+
+    @property
+    def source_to_axis(self) -> Floats:
+        """Distance along `normal` from the source to the axis at its height, (views,) [mm]."""
+        return -_dot(self.normal[:, :2], self.source[:, :2])
+
+    @property
+    def principal(self) -> Floats:
+        """(column, row) of the foot of the perpendicular from the source, (views, 2) [pixel]."""
+        foot = self.source + self.normal * self.source_to_detector[:, None] - self.detector
+        basis = np.stack([self.u, self.v, self.normal], axis=2)
+        return np.linalg.solve(basis, foot[:, :, None])[:, :2, 0] + self._centre
+
+    @property
+    def _centre(self) -> Floats:
+        """(column, row) of the panel's centre."""
+        return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
+
+    def with_motion(self, motion: Motion) -> ConeBeamGeometry:
+        """Absorb the motion of each view into the panel, so that no radiograph is resampled.
+
+        A point that this geometry puts at pixel q, the returned one puts at
+        ``c + magnification (q - c) + shift``, with c the panel's centre and q = (column, row).
+
+        Parameters
+        ----------
+        motion : Motion
+            Shifts in pixels of this geometry's panel: absorb first, bin after.
+
+        Returns
+        -------
+        ConeBeamGeometry
+            With u / m, v / m and detector - (shift_u u + shift_v v) / m.
+        """
+        if motion.views != self.views:
+            raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
+        u = self.u / motion.magnification[:, None]
+        v = self.v / motion.magnification[:, None]
+        detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v
+        return ConeBeamGeometry(
+            source=self.source, detector=detector, u=u, v=v, shape=self.shape
+        )
+
+    def binned(self, factor: int = 2) -> ConeBeamGeometry:
+        """Return the geometry of radiographs averaged over blocks of pixels.
+
+        The last rows and columns that fill no whole block are dropped and the centre of the panel
+        moves with them, so that every pixel stays where it was.
+
+        Parameters
+        ----------
+        factor : int
+            Rows and columns of a block.
+        """
+        factor = _positive("factor", factor)
+        rows, columns = self.rows // factor, self.columns // factor
+        if not rows or not columns:
+            raise ValueError(f"factor: found {factor}, expected at most {min(self.shape)}")
+        lost_u, lost_v = self.columns - columns * factor, self.rows - rows * factor
+        return ConeBeamGeometry(
+            source=self.source,
+            detector=self.detector - 0.5 * (lost_u * self.u + lost_v * self.v),
+            u=self.u * factor,
+            v=self.v * factor,
+            shape=(rows, columns),
+        )
+
+    def subset(self, index: slice | ArrayLike) -> ConeBeamGeometry:
+        """Return some of the views.
+
+        Parameters
+        ----------
+        index : slice, int, integers or boolean mask (views,)
+            Which views, in that order.
+        """
+        chosen = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
+        return ConeBeamGeometry(
+            source=self.source[chosen],
+            detector=self.detector[chosen],
+            u=self.u[chosen],
+            v=self.v[chosen],
+            shape=self.shape,
+        )
+
+    def projection_matrices(self) -> Floats:
+        """Return the matrices that project points to pixels.
+
+        Returns
+        -------
+        ndarray, (views, 3, 4)
+            P with (a, b, g) = P (x, y, z, 1): column = a / g and row = b / g, 0-based. g is the
+            depth of the point as a fraction of the panel's: 0 at the source, 1 on the panel.
+        """
+        rotation = self._to_pixels()
+        return np.concatenate([rotation, -rotation @ self.source[:, :, None]], axis=2)
+
+    def project(self, points: ArrayLike) -> Floats:
+        """Project points to pixels.
+
+        Parameters
+        ----------
+        points : array_like, (n, 3)
+            Positions (x, y, z) [mm].
+
+        Returns
+        -------
+        ndarray, (views, n, 2)
+            (column, row), 0-based; NaN for a point that is not in front of the source.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points: found shape {points.shape}, expected (n, 3)")
+        rotation = self._to_pixels()
+        # Differences first: P (x, 1) would cancel digits where the source is far away.
+        image = (points - self.source[:, None, :]) @ rotation.transpose(0, 2, 1)
+        depth = image[..., 2:]
+        return image[..., :2] / np.where(depth > 0, depth, np.nan)
+
+    def _to_pixels(self) -> Floats:
+        """K [u | v | detector - source]^-1: from a direction at the source to (a, b, g)."""
+        basis = np.stack([self.u, self.v, self.detector - self.source], axis=2)
+        inverse = np.linalg.inv(basis)
+        inverse[:, :2] += self._centre[:, None] * inverse[:, 2:]
+        return inverse
+
+    def to_astra(self) -> Floats:
+        """Return the vectors of ASTRA's ``cone_vec``: source, detector, u, v; (views, 12)."""
+        return np.concatenate([self.source, self.detector, self.u, self.v], axis=1)
+
+    @classmethod
+    def from_astra(cls, vectors: ArrayLike, shape: tuple[int, int]) -> ConeBeamGeometry:
+        """Build from the vectors of ASTRA's ``cone_vec``.
+
+        Parameters
+        ----------
+        vectors : array_like, (views, 12)
+            Source, detector, u and v of each view [mm].
+        shape : (int, int)
+            Rows and columns of the panel.
+        """
+        vectors = np.asarray(vectors, dtype=np.float64)
+        if vectors.ndim != 2 or vectors.shape[1] != 12:
+            raise ValueError(f"vectors: found shape {vectors.shape}, expected (views, 12)")
+        source, detector, u, v = np.split(vectors, 4, axis=1)
+        return cls(source=source, detector=detector, u=u, v=v, shape=shape)
+
+
+def _vectors(name: str, value: ArrayLike) -> Floats:
+    """Check and copy one vector a view; read-only."""
+    array = np.array(value, dtype=np.float64, order="C")
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise ValueError(f"{name}: found shape {array.shape}, expected (views, 3), views >= 1")
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        view = int(np.argmax(bad))
+        raise ValueError(f"{name}: found {array[view]} in view {view}, expected finite numbers")
+    array.flags.writeable = False
+    return array
+
+
+def _panel_shape(shape: Any) -> tuple[int, int]:
+    """Check (rows, columns)."""
+    try:
+        rows, columns = shape
+    except (TypeError, ValueError):
+        raise ValueError(f"shape: found {shape!r}, expected (rows, columns)") from None
+    return _positive("shape", rows), _positive("shape", columns)
+
+
+def _positive(name: str, value: Any) -> int:
+    """Check a whole number of at least one."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name}: found {value!r}, expected a whole number") from None
+    if number < 1:
+        raise ValueError(f"{name}: found {number}, expected at least 1")
+    return number
+
+
+def _refuse(bad: NDArray[np.bool_], found: str, expected: str) -> None:
+    """Raise for the first view for which `bad` holds."""
+    if bad.any():
+        raise ValueError(f"{found} in view {int(np.argmax(bad))}, expected {expected}")
+
+
+def _norm(vectors: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(np.sum(a * b, axis=-1))

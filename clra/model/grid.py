@@ -1,0 +1,189 @@
+"""The grid of voxels on which a volume lives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.model.geometry import _positive
+
+if TYPE_CHECKING:
+    from clra.model.geometry import ConeBeamGeometry
+
+Floats = NDArray[np.float64]
+
+# Part of a voxel by which a grid may fall short of what it covers: without it, rounding in the last
+# bit adds a plane to a grid that fits exactly.
+_SLACK = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeGrid:
+    """A regular grid of cubic voxels; volumes on it are arrays (z, y, x).
+
+    The centre of voxel (k, j, i) is
+    ``centre + ((i - (nx - 1) / 2), (j - (ny - 1) / 2), (k - (nz - 1) / 2)) * voxel_size``.
+
+    Parameters
+    ----------
+    shape : (int, int, int)
+        Voxels (nz, ny, nx).
+    voxel_size : float
+        Edge of a voxel [mm].
+    centre : (float, float, float)
+        Centre (x, y, z) of the grid [mm].
+
+    Raises
+    ------
+    ValueError
+        If a size is not positive or a number is not finite.
+    """
+
+    shape: tuple[int, int, int]
+    voxel_size: float
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if np.shape(self.shape) != (3,):
+            raise ValueError(f"shape: found {self.shape!r}, expected (nz, ny, nx)")
+        size = float(self.voxel_size)
+        if not (math.isfinite(size) and size > 0):
+            raise ValueError(f"voxel_size: found {size}, expected a positive length in mm")
+        if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
+            raise ValueError(f"centre: found {self.centre!r}, expected finite (x, y, z) in mm")
+        nz, ny, nx = (_positive("shape", n) for n in self.shape)
+        x, y, z = (float(c) for c in self.centre)
+        object.__setattr__(self, "shape", (nz, ny, nx))
+        object.__setattr__(self, "voxel_size", size)
+        object.__setattr__(self, "centre", (x, y, z))
+
+    def coordinates(self) -> tuple[Floats, Floats, Floats]:
+        """Return the centres of the voxels along x, y and z, each 1-D [mm]."""
+        x, y, z = (
+            middle + (np.arange(n) - (n - 1) / 2) * self.voxel_size
+            for middle, n in zip(self.centre, self.shape[::-1], strict=True)
+        )
+        return x, y, z
+
+    def index_to_world(self) -> Floats:
+        """Return the (4, 4) matrix from (i, j, k, 1), the index along x, y, z, to mm."""
+        matrix = np.diag([self.voxel_size] * 3 + [1.0])
+        sizes = np.array(self.shape[::-1])
+        matrix[:3, 3] = np.array(self.centre) - (sizes - 1) / 2 * self.voxel_size
+        return matrix
+
+    def slab(self, start: int, stop: int) -> VolumeGrid:
+        """Return the grid of the planes `start` to `stop - 1` along z."""
+        nz, ny, nx = self.shape
+        if not 0 <= start < stop <= nz:
+            raise ValueError(f"slab: found {start}:{stop}, expected 0 <= start < stop <= {nz}")
+        return self._moved((stop - start, ny, nx), self.voxel_size, (0, 0, start))
+
+    def binned(self, factor: int = 2) -> VolumeGrid:
+        """Return the grid of voxels `factor` times larger, with the same lower corner.
+
+        Voxels at the upper ends that fill no whole block are dropped.
+        """
+        factor = _positive("factor", factor)
+        if factor > min(self.shape):
+            raise ValueError(f"factor: found {factor}, expected at most {min(self.shape)}")
+        nz, ny, nx = (n // factor for n in self.shape)
+        return self._moved((nz, ny, nx), self.voxel_size * factor, (0, 0, 0))
+
+    def padded(self, planes: int) -> VolumeGrid:
+        """Return the grid with `planes` more planes at each end of z."""
+        nz, ny, nx = self.shape
+        if nz + 2 * planes < 1:
+            raise ValueError(f"planes: found {planes}, expected more than {-nz / 2:g}")
+        return self._moved((nz + 2 * planes, ny, nx), self.voxel_size, (0, 0, -planes))
+
+    def _moved(
+        self, shape: tuple[int, int, int], voxel_size: float, start: tuple[int, int, int]
+    ) -> VolumeGrid:
+        """Grid whose lower corner is that of this grid's voxel `start` (i, j, k)."""
+        x, y, z = (
+            # Written as a difference of half widths so that an unchanged axis keeps its centre.
+            middle + first * self.voxel_size + 0.5 * (new * voxel_size - old * self.voxel_size)
+            for middle, first, new, old in zip(
+                self.centre, start, shape[::-1], self.shape[::-1], strict=True
+            )
+        )
+        return VolumeGrid(shape=shape, voxel_size=voxel_size, centre=(x, y, z))
+
+
+def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
+    """Return the grid of the field of view.
+
+    A voxel is a pixel seen at the axis, |u| SOD / SDD (median over the views). In x and y the grid
+    covers the circle about the axis that every view sees: its radius is the distance from the axis
+    to the nearer of the planes through the source and a side of the panel, SOD sin(half fan). In z
+    it covers the heights at which the axis is seen by at least half as many views as where it is
+    seen best.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the scan, at the resolution wanted.
+
+    Returns
+    -------
+    VolumeGrid
+        Centred on the axis.
+
+    Raises
+    ------
+    ValueError
+        If a view does not see the axis, or sees it end on.
+    """
+    magnified = geometry.source_to_axis / geometry.source_to_detector
+    if magnified.min() <= 0:
+        raise ValueError(f"view {int(magnified.argmin())}: the axis lies behind the source")
+    voxel = float(np.median(np.linalg.norm(geometry.u, axis=1) * magnified))
+    radius = _circle_radius(geometry)
+    low, high = _axis_range(geometry)
+    across = max(1, math.ceil(2 * radius / voxel - _SLACK))
+    planes = max(1, math.ceil((high - low) / voxel - _SLACK))
+    return VolumeGrid(
+        shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, 0.5 * (low + high))
+    )
+
+
+def _circle_radius(geometry: ConeBeamGeometry) -> float:
+    """Radius of the circle about the axis, at the source's height, that every view sees [mm]."""
+    nearest = np.full(geometry.views, np.inf)
+    for side in (-1, 1):
+        edge = geometry.detector + side * geometry.columns / 2 * geometry.u - geometry.source
+        normal = np.cross(edge, geometry.v)
+        inward = np.sign(np.sum(normal * -side * geometry.u, axis=1))
+        horizontal = np.linalg.norm(normal[:, :2], axis=1)
+        distance = -np.sum(normal[:, :2] * geometry.source[:, :2], axis=1) * inward / horizontal
+        nearest = np.minimum(nearest, distance)
+    view = int(nearest.argmin())
+    if not nearest[view] > 0:
+        raise ValueError(f"view {view} does not see the rotation axis: give a grid")
+    return float(nearest[view])
+
+
+def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:
+    """Lowest and highest point of the axis that enough views see [mm]."""
+    matrices = geometry.projection_matrices()
+    ends = []
+    for row in (-0.5, geometry.rows - 0.5):
+        # row = (b z + b0) / (g z + g0) on the axis, solved for z
+        slope = matrices[:, 1, 2] - row * matrices[:, 2, 2]
+        with np.errstate(divide="ignore"):
+            ends.append((row * matrices[:, 2, 3] - matrices[:, 1, 3]) / slope)
+    low, high = np.sort(ends, axis=0)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError("the rows of a view run along the rotation axis: give a grid")
+    heights = np.sort(np.concatenate([low, high]))
+    middles = 0.5 * (heights[1:] + heights[:-1])
+    seen = np.searchsorted(np.sort(low), middles) - np.searchsorted(np.sort(high), middles)
+    # A piece narrower than rounding is no height at which anything is seen.
+    wide = np.diff(heights) > 1e-12 * (heights[-1] - heights[0])
+    enough = np.flatnonzero(wide & (2 * seen >= seen[wide].max()))
+    return float(heights[enough[0]]), float(heights[enough[-1] + 1])

@@ -1,0 +1,294 @@
+"""Devices, contexts, kernel builds and limits: the one module that knows pyopencl's machinery."""
+
+import os
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+
+from clra import kernels
+from clra.ops import pocl
+
+BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable", "-cl-denorms-are-zero")
+
+
+class NoDeviceError(RuntimeError):
+    """No OpenCL device, or none of the name asked for; the message says what there is."""
+
+
+class KernelBuildError(RuntimeError):
+    """A kernel did not compile; the message carries the compiler's log."""
+
+
+class DeviceMemoryError(RuntimeError):
+    """Work that does not fit on the device; the message says what would."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What a user needs to choose a device.
+
+    Attributes
+    ----------
+    index : str
+        "platform:device", as ``--device`` and ``CLRA_DEVICE`` take it.
+    name, platform, version : str
+        As the driver gives them.
+    kind : str
+        "GPU", "CPU" or "other".
+    memory, largest_buffer : int
+        Bytes of global memory and of the largest single allocation.
+    compute_units : int
+        Cores of a CPU, multiprocessors of a GPU.
+    """
+
+    index: str
+    name: str
+    platform: str
+    version: str
+    kind: str
+    memory: int
+    largest_buffer: int
+    compute_units: int
+
+
+def _all_devices() -> list[tuple[str, cl.Device]]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # the ICD loader raises where no driver is registered
+        return []
+    found = []
+    for p, platform in enumerate(platforms):
+        try:
+            platform_devices = platform.get_devices()
+        except cl.Error:  # a platform without devices raises instead of returning none
+            continue
+        found += [(f"{p}:{d}", device) for d, device in enumerate(platform_devices)]
+    return found
+
+
+def _kind(device: cl.Device) -> str:
+    if device.type & cl.device_type.GPU:
+        return "GPU"
+    return "CPU" if device.type & cl.device_type.CPU else "other"
+
+
+def devices() -> list[DeviceInfo]:
+    """Every OpenCL device of this machine.
+
+    Returns
+    -------
+    list of DeviceInfo
+        Empty where there is none.
+    """
+    return [
+        DeviceInfo(
+            index=index,
+            name=device.name.strip(),
+            platform=device.platform.name.strip(),
+            version=device.platform.version.strip(),
+            kind=_kind(device),
+            memory=device.global_mem_size,
+            largest_buffer=device.max_mem_alloc_size,
+            compute_units=device.max_compute_units,
+        )
+        for index, device in _all_devices()
+    ]
+
+
+def choose_device(device: str | cl.Device | None = None) -> cl.Device:
+    """Select one device.
+
+    An argument beats the environment variable ``CLRA_DEVICE``, which beats ``PYOPENCL_CTX``, which
+    beats the default: the GPU, else the accelerator, else the CPU with the most compute units (of
+    two drivers of one name the newer).
+
+    Parameters
+    ----------
+    device : str or cl.Device, optional
+        "platform:device" indices as :func:`devices` lists them, or a part of the device's or
+        platform's name or version, for example "nvidia" or "PoCL 3.1".
+
+    Returns
+    -------
+    cl.Device
+
+    Raises
+    ------
+    NoDeviceError
+        If there is no device or none that matches; says what was found and how to get PoCL.
+    """
+    if isinstance(device, cl.Device):
+        return device
+    found = _all_devices()
+    if not found:
+        raise NoDeviceError(
+            "no OpenCL device: install a GPU driver with OpenCL, or PoCL for the CPU "
+            "(pip install 'clra[pocl]', or apt-get install pocl-opencl-icd)"
+        )
+    wanted = device or os.environ.get("CLRA_DEVICE") or os.environ.get("PYOPENCL_CTX")
+    if wanted:
+        for index, candidate in found:
+            if wanted in (index, index.partition(":")[0]):
+                return candidate
+        text = wanted.lower()
+        for _, candidate in found:
+            platform = candidate.platform
+            if text in f"{candidate.name} {platform.name} {platform.version}".lower():
+                return candidate
+        listing = ", ".join(f"{i} {d.name.strip()} ({d.platform.version})" for i, d in found)
+        raise NoDeviceError(f"no OpenCL device {wanted!r}; found {listing}")
+    rank = {"GPU": 2, "other": 1, "CPU": 0}
+    return max(
+        (candidate for _, candidate in found),
+        key=lambda d: (rank[_kind(d)], d.max_compute_units, d.platform.version),
+    )
+
+
+def create_context(device: str | cl.Device | None = None) -> cl.Context:
+    """Context on the device that :func:`choose_device` selects."""
+    return cl.Context([choose_device(device)])
+
+
+def device_of(owner: cl.Context | cl.CommandQueue) -> cl.Device:
+    """Device of a queue, or the only (else first) device of a context."""
+    return owner.device if isinstance(owner, cl.CommandQueue) else owner.devices[0]
+
+
+def is_cpu(device: cl.Device) -> bool:
+    """Whether the device is a CPU, whose best kernel form differs from a GPU's."""
+    return bool(device.type & cl.device_type.CPU)
+
+
+_programs: dict[tuple[int, str, tuple[str, ...]], cl.Program] = {}
+_programs_lock = threading.Lock()
+
+
+def build(
+    context: cl.Context, name: str, defines: Mapping[str, object] | None = None
+) -> cl.Program:
+    """Compile one kernel file, once a context and set of definitions; thread-safe.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where to build, for all its devices.
+    name : str
+        File in ``kernels/``.
+    defines : mapping, optional
+        Preprocessor definitions.
+
+    Returns
+    -------
+    cl.Program
+
+    Raises
+    ------
+    KernelBuildError
+        With the compiler's log.
+    """
+    options = [*BUILD_OPTIONS, *(f"-D{key}={value}" for key, value in (defines or {}).items())]
+    # The program retains its context, so that a context's address is not given to another one
+    # as long as the entry stands.
+    key = (context.int_ptr, name, tuple(options))
+    with _programs_lock:
+        if key not in _programs:
+            _programs[key] = _compile(context, name, options)
+        return _programs[key]
+
+
+def _compile(context: cl.Context, name: str, options: Sequence[str]) -> cl.Program:
+    try:
+        return _compile_once(context, name, options)
+    except KernelBuildError as error:
+        mended = pocl.SYMPTOM in str(error) and [
+            device for device in context.devices if pocl.mend_cpu_name(device)
+        ]
+        if not mended:
+            raise
+    return _compile_once(context, name, options)
+
+
+def _compile_once(context: cl.Context, name: str, options: Sequence[str]) -> cl.Program:
+    # pyopencl's public build() adds an include path, which breaks several drivers where it holds a
+    # blank, and a binary cache that outlives driver updates; drivers cache by themselves.
+    program = cl._cl._Program(context, kernels.source(name))
+    try:
+        program.build(" ".join(options).encode())
+    except cl.Error as error:
+        raise KernelBuildError(f"kernel {name} does not build: {error}") from None
+    return cl.Program(program)
+
+
+def kernel(
+    context: cl.Context, name: str, function: str, defines: Mapping[str, object] | None = None
+) -> cl.Kernel:
+    """Return a new kernel object: its arguments are its owner's alone."""
+    return cl.Kernel(build(context, name, defines), function)
+
+
+def check_array(
+    name: str,
+    array: Any,
+    shape: tuple[int, ...],
+    dtype: Any = np.float32,
+    context: cl.Context | None = None,
+) -> None:
+    """Refuse what an operator cannot work on.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, for the message.
+    array : cl.array.Array
+        To be checked; an offset into its buffer is fine.
+    shape : tuple of int
+        Expected shape.
+    dtype : dtype-like
+        Expected type.
+    context : cl.Context, optional
+        Context that the array has to belong to.
+
+    Raises
+    ------
+    TypeError
+        If it is no device array or of another type.
+    ValueError
+        If shape, memory order or context differ.
+    """
+    if not isinstance(array, cl.array.Array):
+        raise TypeError(f"{name}: found {type(array).__name__}, expected a pyopencl.array.Array")
+    if array.dtype != np.dtype(dtype):
+        raise TypeError(f"{name}: found {array.dtype}, expected {np.dtype(dtype)}")
+    if array.shape != tuple(shape):
+        raise ValueError(f"{name}: found shape {array.shape}, expected {tuple(shape)}")
+    if not array.flags.c_contiguous:
+        raise ValueError(f"{name}: found strides {array.strides}, expected C order")
+    if context is not None and array.context != context:
+        raise ValueError(f"{name}: its context {array.context} is not the operator's {context}")
+
+
+def buffer_argument(array: cl.array.Array) -> tuple[Any, np.uint64]:
+    """Buffer and offset in elements: the two arguments by which every kernel takes an array."""
+    return array.base_data, np.uint64(array.offset // array.dtype.itemsize)
+
+
+def global_size(shape: Sequence[int], local: Sequence[int]) -> tuple[int, ...]:
+    """`shape` rounded up to whole work-groups."""
+    return tuple(-(-n // m) * m for n, m in zip(shape, local, strict=True))
+
+
+def work_group_size(
+    function: cl.Kernel, device: cl.Device, wanted: Sequence[int]
+) -> tuple[int, ...]:
+    """`wanted`, halved from the last dimension on until the built kernel allows it."""
+    limit = function.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device)
+    sizes = [min(n, m) for n, m in zip(wanted, device.max_work_item_sizes, strict=False)]
+    while np.prod(sizes) > limit:
+        largest = max(range(len(sizes)), key=lambda axis: (sizes[axis], axis))
+        sizes[largest] = max(1, sizes[largest] // 2)
+    return tuple(sizes)

@@ -1,0 +1,28 @@
+"""Fixtures that every test may use."""
+
+import os
+from pathlib import Path
+
+import pyopencl as cl
+import pytest
+
+from clra.ops import opencl
+
+
+@pytest.fixture(scope="session")
+def context() -> cl.Context:
+    return opencl.create_context()
+
+
+@pytest.fixture
+def queue(context: cl.Context) -> cl.CommandQueue:
+    return cl.CommandQueue(context)
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder of public real data, which is no part of the repository."""
+    folder = os.environ.get("CLRA_TEST_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("CLRA_TEST_DATA names no folder of test data")
+    return Path(folder)
