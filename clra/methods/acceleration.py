@@ -1,0 +1,62 @@
+"""Anderson acceleration of a fixed-point iteration."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# Tikhonov weight relative to the squared norm of the differences: at a tenth of it random motions
+# make the extrapolation noisy, at ten times it slow modes stay slow.
+_DAMPING = 1e-3
+# An extrapolated step longer than this many plain ones is not believed.
+_LONGEST = 3.0
+
+
+class Anderson:
+    """Extrapolate ``x <- x + f(x)`` from its last few steps (type II, windowed).
+
+    The next point is ``x + f - (dX + dF) g`` with g the damped least-squares solution of
+    ``dF g = f``, dX and dF the last differences of x and f. The first step is plain: the
+    extrapolation would otherwise learn from the one step whose reconstruction was blurred.
+
+    Parameters
+    ----------
+    memory : int
+        Differences kept; 0 leaves the iteration plain.
+    floor : float
+        Steps below this length are always believed, in the units of x.
+
+    References
+    ----------
+    .. [1] H. F. Walker, P. Ni, "Anderson acceleration for fixed-point iterations", SIAM J. Numer.
+       Anal. 49, 1715 (2011).
+    """
+
+    def __init__(self, memory: int = 3, *, floor: float = 0.5) -> None:
+        self.memory = memory
+        self.floor = floor
+        self._points: list[Floats] = []
+        self._steps: list[Floats] = []
+
+    def next(self, x: Floats, f: Floats) -> Floats:
+        """Return the next point.
+
+        Parameters
+        ----------
+        x : ndarray
+            Where the iteration stands.
+        f : ndarray
+            The plain step from there.
+        """
+        self._points = [*self._points, x][-(self.memory + 1) :]
+        self._steps = [*self._steps, f][-(self.memory + 1) :]
+        if len(self._steps) < 2:
+            return x + f
+        dx = np.diff(np.stack(self._points, axis=-1).reshape(x.size, -1))
+        df = np.diff(np.stack(self._steps, axis=-1).reshape(x.size, -1))
+        normal = df.T @ df
+        normal += _DAMPING * np.trace(normal) * np.eye(len(normal))
+        step = f - ((dx + df) @ np.linalg.solve(normal, df.T @ f.ravel())).reshape(f.shape)
+        if np.abs(step).max() > _LONGEST * max(float(np.abs(f).max()), self.floor):
+            return x + f
+        return np.asarray(x + step)

@@ -1,0 +1,282 @@
+"""Re-projection alignment: Algorithms 1 and 2 of the paper.
+
+Reconstruct from the radiographs as they are, project the volume forward, register each measured
+radiograph with its simulated twin, correct, repeat; first at a quarter of the resolution, then at
+half. The correction is absorbed into the geometry: no radiograph is resampled, and the simulated
+ones come out in the frame of the measured ones, so that what registration finds is what is left.
+"""
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.acceleration import Anderson
+from clra.methods.fbp import ramp_fbp
+from clra.methods.outliers import from_neighbours, outliers
+from clra.methods.reprojection import Registered, reproject_and_register
+from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
+from clra.model.gauge import gauge_fit, motion_error, sample_points
+from clra.model.grid import VolumeGrid, default_grid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+from clra.model.schedule import Stage, converged, level_name, parse_schedule
+from clra.ops.registration import Registration
+from clra.ops.streaming import Radiographs, Report, Stream
+
+Floats = NDArray[np.float64]
+
+METHODS = ("ra",)
+ESTIMATES = ("shift", "shift+scale")
+
+# Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look past
+# it, and what they see there has to be in the re-projection too.
+_MARGIN = 0.15
+# Sigma of the band-pass in pixels of the level, first iteration and later: the first
+# reconstruction is blurred by the motion itself, and its fine detail is not the sample's.
+_FIRST_LOW_PASS, _LOW_PASS, _HIGH_PASS = 2.0, 1.0, 16.0
+
+
+def align(
+    scan: Scan,
+    method: str = "ra",
+    schedule: str = "auto",
+    estimate: str = "shift+scale",
+    grid: VolumeGrid | None = None,
+    device: Any = None,
+    *,
+    motion: Motion | None = None,
+    truth: Motion | None = None,
+    progress: Report | None = None,
+    memory: int = 3,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
+) -> AlignmentResult:
+    """Estimate how each radiograph moved.
+
+    Parameters
+    ----------
+    scan : Scan
+        At least two views.
+    method : {"ra"}
+        Re-projection alignment before reconstruction.
+    schedule : str
+        Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": a quarter of
+        the resolution until converged (at most 6 iterations), then one at half.
+    estimate : {"shift+scale", "shift"}
+        Whether the magnification of each view is estimated or taken as 1.
+    grid : VolumeGrid, optional
+        Full-resolution grid that holds the sample; by default the whole field of view.
+    device : str or cl.Device, optional
+        As :func:`clra.ops.opencl.choose_device` takes it.
+    motion : Motion, optional
+        Where to start; by default no motion.
+    truth : Motion, optional
+        To report errors against; by default the scan's own, if it is a simulated one.
+    progress : callable, optional
+        Called with a :class:`clra.ops.streaming.Progress` as work goes on.
+    memory : int
+        Iterations that Anderson acceleration looks back on within a level; 0 for the paper's plain
+        iteration.
+    max_device_memory, max_host_memory : int, optional
+        Bytes that may be used.
+
+    Returns
+    -------
+    AlignmentResult
+
+    Raises
+    ------
+    ValueError
+        If an option is none of its choices or the scan has less than two views.
+    AlignmentInterrupted
+        On Ctrl-C after at least one iteration; carries the result so far.
+
+    References
+    ----------
+    .. [1] "Multi-resolution radiograph alignment for motion correction in X-ray micro-tomography",
+       Algorithms 1 and 2.
+    """
+    _check(scan, method, estimate)
+    stages = parse_schedule(schedule)
+    stream = Stream(
+        device,
+        max_device_memory=max_device_memory,
+        max_host_memory=max_host_memory,
+        report=progress,
+    )
+    grid = grid or default_grid(scan.geometry)
+    grid = grid.padded(round(_MARGIN * grid.shape[0]))
+    run = _Run(stream, scan, grid, schedule, estimate == "shift+scale", memory)
+    run.motion = motion or Motion.identity(scan.views)
+    run.truth = truth or scan.truth
+    try:
+        for stage in stages:
+            run.align_level(stage)
+    except KeyboardInterrupt:
+        if not run.history:
+            raise
+        raise AlignmentInterrupted(run.result()) from None
+    return run.result()
+
+
+def _check(scan: Scan, method: str, estimate: str) -> None:
+    if method not in METHODS:
+        raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
+    if estimate not in ESTIMATES:
+        raise ValueError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
+    if scan.views < 2:
+        raise ValueError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")
+
+
+@dataclass
+class _Run:
+    """The state that the levels of one alignment hand on."""
+
+    stream: Stream
+    scan: Scan
+    grid: VolumeGrid
+    schedule: str
+    scale: bool
+    memory: int
+    motion: Motion = field(init=False)
+    truth: Motion | None = field(init=False, default=None)
+    history: list[Iteration] = field(init=False, default_factory=list)
+    registered: Registered = field(init=False)
+    weak: NDArray[np.bool_] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.points = sample_points(self.grid)
+
+    def align_level(self, stage: Stage) -> None:
+        """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level)."""
+        name = level_name(stage.level)
+        # 1, 7: down-sample the measured radiographs
+        radiographs = Radiographs(self.stream, self.scan, stage.level)
+        anderson = Anderson(self.memory)
+        previous = None
+        for iteration in range(1, (stage.iterations or stage.limit) + 1):
+            started = time.perf_counter()
+            of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
+            found = self._iterate(radiographs, first=not self.history, title=of)
+            self._move(found, anderson)
+            update_u, update_v = np.abs(found.motion.shift_u), np.abs(found.motion.shift_v)
+            self.history.append(
+                Iteration(
+                    level=name,
+                    iteration=iteration,
+                    update_u_median=float(np.median(update_u)),
+                    update_v_median=float(np.median(update_v)),
+                    update_max=float(max(update_u.max(), update_v.max())),
+                    correlation=float(np.median(found.correlation)),
+                    residual=float(np.median(found.residual)),
+                    seconds=time.perf_counter() - started,
+                    **self._errors(),
+                )
+            )
+            # 6, 13: until converged
+            if stage.iterations is None and converged(update_u, update_v, previous):
+                break
+            previous = float(np.median(np.concatenate([update_u, update_v])))
+
+    def _iterate(self, radiographs: Radiographs, *, first: bool, title: str) -> Registered:
+        """Algorithm 1, steps 2 to 4."""
+        stream, level = self.stream, radiographs.level
+        # Motions are in full-resolution pixels: absorb first, then bin.
+        geometry = self.scan.geometry.with_motion(self.motion).binned(level)
+        # 2: reconstruct from the corrected radiographs
+        volume = ramp_fbp(
+            stream,
+            radiographs,
+            geometry,
+            self.grid.binned(level) if level > 1 else self.grid,
+            stage=f"{title}: reconstructing",
+        )
+        registration = Registration(
+            stream.context,
+            geometry.shape,
+            views=max(
+                c.stop - c.start for c in stream.chunks(geometry.views, radiographs.view_bytes)
+            ),
+            low_pass=_FIRST_LOW_PASS if first else _LOW_PASS,
+            high_pass=_HIGH_PASS,
+            mask=None if self.scan.mask is None else _binned_mask(self.scan.mask, level),
+            magnification=self.scale,
+        )
+        # 3, 4: simulate and register
+        return reproject_and_register(
+            stream,
+            radiographs,
+            volume,
+            geometry,
+            registration,
+            lost=(self.scan.geometry.rows % level, self.scan.geometry.columns % level),
+            stage=f"{title}: registering",
+        )
+
+    def _move(self, found: Registered, anderson: Anderson) -> None:
+        """Algorithm 1, step 5: append what was found to the motion known so far."""
+        self.registered = found
+        self.weak = outliers(found.correlation)
+        here = self._as_lengths(self.motion)
+        there = self._as_lengths(from_neighbours(self.motion.then(found.motion), self.weak))
+        moved = anderson.next(here, there - here)
+        half = self._lever
+        self.motion = Motion(
+            shift_u=moved[0],
+            shift_v=moved[1],
+            magnification=np.exp(moved[2] / half) if self.scale else None,
+        ).normalised()
+
+    @property
+    def _lever(self) -> float:
+        """Pixels by which a point of middling distance from the centre moves a unit of scale."""
+        return 0.25 * float(np.hypot(*self.scan.geometry.shape))
+
+    def _as_lengths(self, motion: Motion) -> Floats:
+        """Write the motion as rows of one unit, so that none rules the extrapolation."""
+        rows = [motion.shift_u, motion.shift_v]
+        if self.scale:
+            rows.append(self._lever * np.log(motion.magnification))
+        return np.stack(rows)
+
+    def _errors(self) -> dict[str, float]:
+        if self.truth is None:
+            return {}
+        error = motion_error(
+            self.motion, self.truth, self.scan.geometry, self.points, magnification=self.scale
+        )
+        return {
+            name: getattr(error, name)
+            for name in (
+                "mae_u",
+                "mae_v",
+                "mae_m",
+                "gauge_free_u",
+                "gauge_free_v",
+                "gauge_free_m",
+            )
+        }
+
+    def result(self) -> AlignmentResult:
+        """Return what the iterations so far gave."""
+        gauge = gauge_fit(self.scan.geometry, self.motion, self.points, magnification=self.scale)
+        return AlignmentResult(
+            motion=self.motion,
+            history=self.history,
+            confidence=np.clip(np.where(self.weak, 0.0, self.registered.correlation), 0.0, 1.0),
+            sigma=self.registered.sigma,
+            gauge=dict(gauge.rms_by_mode),
+            flagged=tuple(int(view) for view in np.flatnonzero(self.weak)),
+            schedule=self.schedule,
+            device=self.stream.device.name.strip(),
+        )
+
+
+def _binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:
+    """Bin a mask: a pixel may be used if all its parts may."""
+    rows, columns = (n // level for n in mask.shape)
+    blocks = mask[: rows * level, : columns * level].reshape(rows, level, columns, level)
+    return np.asarray(blocks.all(axis=(1, 3)))

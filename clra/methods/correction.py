@@ -1,0 +1,72 @@
+"""Radiographs as they would have been without motion, for export and for ideal-row methods."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+from clra.ops.streaming import Stream
+from clra.ops.warp import Warp
+
+
+def correct(scan: Scan, motion: Motion, device: Any = None) -> Scan:
+    """Undo the motion of each radiograph by resampling it.
+
+    Every radiograph is interpolated once, from the measured pixels, by cubic B-splines. Methods
+    that can absorb the motion into the geometry instead (``geometry.with_motion``) should.
+
+    Parameters
+    ----------
+    scan : Scan
+        As measured.
+    motion : Motion
+        Of its views, as :func:`clra.align` found it.
+    device : str or cl.Device, optional
+        As :func:`clra.ops.opencl.choose_device` takes it.
+
+    Returns
+    -------
+    Scan
+        Line integrals; a radiograph is read and corrected when it is asked for.
+
+    Raises
+    ------
+    ValueError
+        If the motion is of another number of views.
+    """
+    if motion.views != scan.views:
+        raise ValueError(f"motion: found {motion.views} views, expected {scan.views}")
+    return Scan(
+        _Corrected(scan, motion, Stream(device)),
+        scan.geometry,
+        name=f"{scan.name}, corrected",
+        mask=scan.mask,
+    )
+
+
+class _Corrected:
+    """Corrected line integrals (views, rows, columns), made as they are read."""
+
+    def __init__(self, scan: Scan, motion: Motion, stream: Stream) -> None:
+        self.shape = scan.shape
+        self._scan = scan
+        self._stream = stream
+        self._warp = Warp(stream.context, scan.geometry.shape)
+        self._motion = np.stack(
+            [motion.shift_u, motion.shift_v, motion.magnification], axis=1
+        ).astype(np.float32)
+
+    def __getitem__(self, views: slice) -> NDArray[np.float32]:
+        start, stop, _ = views.indices(self.shape[0])
+        out = np.empty((stop - start, *self.shape[1:]), np.float32)
+        stream = self._stream
+        for chunk in stream.chunks(stop - start, out[:1].nbytes):
+            part = slice(start + chunk.start, start + chunk.stop)
+            measured = stream.upload(self._scan.read(part.start, part.stop))
+            corrected = stream.empty(measured.shape)
+            motion = stream.upload(np.ascontiguousarray(self._motion[part]))
+            self._warp(stream.queue, corrected, measured, motion)
+            out[chunk] = stream.download(corrected)
+        return out

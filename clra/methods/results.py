@@ -1,0 +1,94 @@
+"""What an alignment returns."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.model.motion import Motion
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One iteration of re-projection alignment; lengths in pixels of the full-resolution panel.
+
+    Attributes
+    ----------
+    level : str
+        "QR", "HR" or "FR".
+    iteration : int
+        From 1 at each level.
+    update_u_median, update_v_median, update_max : float
+        Medians of |shift found| in u and v, and the largest in either.
+    correlation, residual : float
+        Medians over the views, after registration.
+    seconds : float
+        Time it took.
+    mae_u, mae_v, mae_m, gauge_free_u, gauge_free_v, gauge_free_m : float or None
+        Mean absolute errors after the iteration where the truth is known.
+    """
+
+    level: str
+    iteration: int
+    update_u_median: float
+    update_v_median: float
+    update_max: float
+    correlation: float
+    residual: float
+    seconds: float
+    mae_u: float | None = None
+    mae_v: float | None = None
+    mae_m: float | None = None
+    gauge_free_u: float | None = None
+    gauge_free_v: float | None = None
+    gauge_free_m: float | None = None
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """What alignment found and how good it is.
+
+    Attributes
+    ----------
+    motion : Motion
+        Of each view, in pixels of the full-resolution panel; mean(log magnification) = 0.
+    history : list of Iteration
+        One entry an iteration.
+    confidence : ndarray, (views,)
+        Correlation of each measured radiograph with its simulated twin in the band used, clipped to
+        0..1, after the last registration.
+    sigma : ndarray, (views, 3)
+        Standard errors of shift_u, shift_v [pixel] and magnification, from that registration.
+    gauge : dict of str to float
+        RMS [pixel] of the part of `motion` that each movement of the sample as a whole explains:
+        data see that part badly, and the volume is as sharp with it as without.
+    flagged : tuple of int
+        Views whose registration is not believed; they have their neighbours' motion.
+    schedule, device : str
+        What was run, and on what.
+    """
+
+    motion: Motion
+    history: list[Iteration]
+    confidence: Floats
+    sigma: Floats
+    gauge: dict[str, float]
+    flagged: tuple[int, ...]
+    schedule: str
+    device: str
+
+
+class AlignmentInterrupted(KeyboardInterrupt):
+    """Ctrl-C during alignment.
+
+    Attributes
+    ----------
+    result : AlignmentResult
+        What the iterations that were finished gave.
+    """
+
+    def __init__(self, result: AlignmentResult) -> None:
+        super().__init__("alignment was interrupted")
+        self.result = result

@@ -1,0 +1,156 @@
+"""Re-projection alignment of scans whose motion is known; radiographs are closed forms."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import clra
+from clra.methods.alignment import AlignmentInterrupted
+from clra.model.gauge import motion_error, sample_points, without_gauge
+from clra.model.grid import default_grid
+from clra.model.perturbation import random_motion, smooth_motion
+from clra.model.phantom import porous
+
+# The paper's simulation at a quarter of its resolution, cut to a third of its height.
+VIEWS, SHAPE = 180, (128, 128)
+SCALE = 4
+HEIGHT = 0.7
+RADIUS = 240 * 0.004544
+# Pixels of the panel as simulated, gauge-free: the paper's result for space-filling scans is 0.20
+# at four times this resolution.
+TOLERANCE = 0.20
+
+
+@pytest.fixture(scope="module")
+def geometry():
+    return clra.space_filling(
+        VIEWS,
+        z_step=HEIGHT / VIEWS,
+        source_to_axis=4.3627,
+        source_to_detector=436.27,
+        pixel_size=0.4544 * SCALE,
+        shape=SHAPE,
+    )
+
+
+def _truth(geometry, magnification):
+    jitter = random_motion(VIEWS, seed=0, shift=(-4, 4), magnification=magnification / 2)
+    drift = smooth_motion(VIEWS, seed=1, shift=(-4, 4), magnification=magnification / 2)
+    points = sample_points(default_grid(geometry))
+    return without_gauge(jitter.then(drift), geometry, [points], magnification > 0), points
+
+
+@pytest.fixture(scope="module")
+def moved(geometry):
+    truth, _ = _truth(geometry, 0.002)
+    rock = porous(RADIUS, 2.0, seed=4)
+    return clra.Scan(rock.line_integrals(geometry.with_motion(truth)), geometry, truth=truth)
+
+
+@pytest.fixture(scope="module")
+def result(moved):
+    return clra.align(moved, schedule="1QR-1HR")
+
+
+def test_motion_is_found(moved, result):
+    points = sample_points(default_grid(moved.geometry))
+    error = motion_error(result.motion, moved.truth, moved.geometry, points)
+    assert error.gauge_free_u < TOLERANCE
+    assert error.gauge_free_v < TOLERANCE
+    assert error.gauge_free_m < 3e-4
+    assert np.mean(np.log(result.motion.magnification)) == pytest.approx(0, abs=1e-12)
+
+
+def test_history_tells_each_iteration(result):
+    assert [(entry.level, entry.iteration) for entry in result.history] == [("QR", 1), ("HR", 1)]
+    first, second = result.history
+    assert second.update_u_median < first.update_u_median
+    assert second.gauge_free_u < first.gauge_free_u
+    assert second.correlation > first.correlation
+    assert second.residual < first.residual
+
+
+def test_every_view_has_a_confidence_and_standard_errors(result):
+    assert result.confidence.shape == (VIEWS,)
+    assert (result.confidence > 0.5).all()
+    assert (result.confidence <= 1).all()
+    assert result.sigma.shape == (VIEWS, 3)
+    assert (result.sigma > 0).all()
+    assert (result.sigma[:, :2] < 0.5).all()
+    assert result.flagged == ()
+
+
+def test_gauge_names_the_movements_of_the_sample(result):
+    assert set(result.gauge) >= {"translation x", "translation z", "tilt x", "scale", "stretch z"}
+    assert all(value >= 0 for value in result.gauge.values())
+
+
+def test_blank_views_spoil_nothing_else(moved, result):
+    pixels = moved.read(0, VIEWS).copy()
+    pixels[[20, 90, 91]] = 0.0
+    blanked = clra.align(clra.Scan(pixels, moved.geometry, truth=moved.truth), schedule="1QR-1HR")
+    assert blanked.flagged == (20, 90, 91)
+    assert not blanked.confidence[list(blanked.flagged)].any()
+    others = np.delete(np.arange(VIEWS), blanked.flagged)
+    for name in ("shift_u", "shift_v"):
+        change = getattr(blanked.motion, name) - getattr(result.motion, name)
+        assert np.abs(change[others]).mean() < 0.1
+
+
+def test_shift_only_leaves_the_magnification_alone(geometry):
+    truth, _ = _truth(geometry, 0.0)
+    rock = porous(RADIUS, 2.0, seed=4)
+    scan = clra.Scan(rock.line_integrals(geometry.with_motion(truth)), geometry)
+    found = clra.align(scan, schedule="1QR", estimate="shift", truth=truth)
+    assert (found.motion.magnification == 1).all()
+    assert found.history[0].gauge_free_u < 0.5
+    assert np.isfinite(found.history[0].mae_u)
+
+
+def test_lengths_in_micrometres_give_the_same_motion(moved, result):
+    vectors = moved.geometry.to_astra() * 1000
+    geometry = clra.ConeBeamGeometry.from_astra(vectors, moved.geometry.shape)
+    # line integrals are numbers without unit: the same radiographs
+    found = clra.align(clra.Scan(moved.projections, geometry), schedule="1QR-1HR")
+    for name in ("shift_u", "shift_v"):
+        change = getattr(found.motion, name) - getattr(result.motion, name)
+        assert np.abs(change).max() < 0.02
+
+
+def test_interruption_keeps_what_was_finished(moved):
+    def stop_at_half(progress):
+        if progress.stage.startswith("HR"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(AlignmentInterrupted) as caught:
+        clra.align(moved, schedule="1QR-1HR", progress=stop_at_half)
+    assert [entry.level for entry in caught.value.result.history] == ["QR"]
+    assert caught.value.result.motion.views == VIEWS
+
+
+def test_progress_names_stage_and_counts(moved):
+    seen = []
+    clra.align(moved.subset(slice(0, 40)), schedule="1QR", progress=seen.append)
+    stages = list(dict.fromkeys(entry.stage for entry in seen))
+    assert [stage.rpartition(": ")[2] for stage in stages][1:] == ["reconstructing", "registering"]
+    assert all(0 <= entry.done <= entry.total for entry in seen)
+    assert all(dataclasses.astuple(entry)[1:] for entry in seen)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "magic"}, "method: found 'magic'"),
+        ({"estimate": "tilt"}, "estimate: found 'tilt'"),
+        ({"schedule": "3XR"}, "schedule: found '3XR'"),
+    ],
+)
+def test_options_that_are_none(moved, options, message):
+    with pytest.raises(ValueError, match=message):
+        clra.align(moved, **options)
+
+
+def test_one_view_cannot_be_aligned(moved):
+    with pytest.raises(ValueError, match="found 1 view, expected at least 2"):
+        clra.align(moved.subset([3]))

@@ -1,0 +1,58 @@
+"""Warped radiographs against what the ideal geometry would have shown, by closed form."""
+
+import numpy as np
+import pytest
+
+import clra
+from clra.model.phantom import Ellipsoids
+
+SHAPE = (45, 53)
+
+
+@pytest.fixture
+def geometry():
+    return clra.circular(
+        7, source_to_axis=100.0, source_to_detector=150.0, pixel_size=0.5, shape=SHAPE
+    )
+
+
+@pytest.fixture
+def motion():
+    rng = np.random.default_rng(5)
+    return clra.Motion(
+        shift_u=rng.uniform(-2, 2, 7),
+        shift_v=rng.uniform(-2, 2, 7),
+        magnification=rng.uniform(0.99, 1.01, 7),
+    )
+
+
+def _smooth(geometry):
+    """Radiographs without edges: a stack of many thin shells is close to a bump."""
+    radii = np.linspace(1.0, 6.0, 40)
+    bump = Ellipsoids(
+        centres=np.tile((0.3, -0.2, 0.4), (40, 1)), radii=radii, attenuation=np.full(40, 0.01)
+    )
+    return bump.line_integrals(geometry)
+
+
+def test_correction_undoes_the_motion(geometry, motion):
+    ideal = _smooth(geometry)
+    moved = clra.Scan(_smooth(geometry.with_motion(motion)), geometry, name="moved")
+    corrected = clra.correct(moved, motion)
+    error = corrected.read(0, 7) - ideal
+    before = moved.read(0, 7) - ideal
+    inside = (slice(None), slice(5, -5), slice(5, -5))
+    assert np.abs(error[inside]).max() < 0.01 * ideal.max()
+    assert np.abs(error[inside]).max() < 0.1 * np.abs(before[inside]).max()
+    assert corrected.name == "moved, corrected"
+
+
+def test_views_are_corrected_as_they_are_read(geometry, motion):
+    scan = clra.correct(clra.Scan(_smooth(geometry), geometry), motion)
+    assert np.array_equal(scan.read(2, 5), scan.read(0, 7)[2:5])
+
+
+def test_a_motion_of_other_length_is_refused(geometry):
+    scan = clra.Scan(np.zeros((7, *SHAPE), np.float32), geometry)
+    with pytest.raises(ValueError, match="motion: found 6 views, expected 7"):
+        clra.correct(scan, clra.Motion.identity(6))

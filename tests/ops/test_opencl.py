@@ -1,0 +1,129 @@
+"""Devices, builds, argument checks; and the cure for PoCL on CPUs it does not know."""
+
+import io
+import struct
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+
+from clra import kernels
+from clra.ops import opencl, pocl
+
+
+def test_devices_are_listed_and_can_be_chosen_by_what_is_listed(context):
+    listed = opencl.devices()
+    assert listed
+    for info in listed:
+        assert opencl.choose_device(info.index).name.strip() == info.name
+        assert info.largest_buffer <= info.memory
+        assert info.kind in ("GPU", "CPU", "other")
+
+
+def test_unknown_device_lists_what_was_found():
+    with pytest.raises(opencl.NoDeviceError, match=r"no OpenCL device 'voodoo'; found 0:0 "):
+        opencl.choose_device("voodoo")
+
+
+def test_argument_beats_clra_device_beats_pyopencl_ctx(monkeypatch):
+    monkeypatch.setenv("PYOPENCL_CTX", "nothing like it")
+    monkeypatch.setenv("CLRA_DEVICE", "0:0")
+    assert opencl.choose_device() == opencl.choose_device("0:0")
+    monkeypatch.setenv("CLRA_DEVICE", "also nothing")
+    assert opencl.choose_device("0:0")
+    with pytest.raises(opencl.NoDeviceError, match="also nothing"):
+        opencl.choose_device()
+    monkeypatch.delenv("CLRA_DEVICE")
+    with pytest.raises(opencl.NoDeviceError, match="nothing like it"):
+        opencl.choose_device()
+
+
+def test_no_device_at_all_says_how_to_get_one(monkeypatch):
+    def none():
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    with pytest.raises(opencl.NoDeviceError, match=r"pip install 'clra\[pocl\]'"):
+        opencl.choose_device()
+    assert opencl.devices() == []
+
+
+def test_build_is_cached_and_a_kernel_is_not(context):
+    first, second = (opencl.build(context, "transpose.cl") for _ in range(2))
+    assert first is second
+    name = first.all_kernels()[0].function_name
+    assert opencl.kernel(context, "transpose.cl", name) != opencl.kernel(
+        context, "transpose.cl", name
+    )
+
+
+def test_a_kernel_that_does_not_compile_raises_with_the_log(context, monkeypatch):
+    monkeypatch.setattr(kernels, "source", lambda name: "__kernel void f( { nonsense }")
+    with pytest.raises(opencl.KernelBuildError, match=r"(?s)broken\.cl.*error"):
+        opencl.build(context, "broken.cl")
+
+
+def test_check_array_names_both_sides(context, queue):
+    good = cl.array.zeros(queue, (3, 4), np.float32)
+    opencl.check_array("x", good, (3, 4), context=context)
+    with pytest.raises(ValueError, match=r"x: found shape \(3, 4\), expected \(4, 3\)"):
+        opencl.check_array("x", good, (4, 3))
+    with pytest.raises(TypeError, match="x: found float32, expected complex64"):
+        opencl.check_array("x", good, (3, 4), np.complex64)
+    with pytest.raises(TypeError, match=r"x: found ndarray, expected a pyopencl\.array\.Array"):
+        opencl.check_array("x", np.zeros((3, 4), np.float32), (3, 4))
+    with pytest.raises(ValueError, match="expected C order"):
+        opencl.check_array("x", good.T, (4, 3))
+    with pytest.raises(ValueError, match="is not the operator's"):
+        opencl.check_array("x", good, (3, 4), context=cl.Context(context.devices))
+
+
+def test_offset_is_counted_in_elements(queue):
+    whole = cl.array.zeros(queue, 10, np.float32)
+    buffer, offset = opencl.buffer_argument(whole[3:])
+    assert buffer == whole.base_data
+    assert offset == 3
+
+
+def test_global_size_rounds_up():
+    assert opencl.global_size((5, 8, 1), (4, 8, 1)) == (8, 8, 1)
+
+
+class _Memory(io.BytesIO):
+    """Stands for the process's memory: a device record at 64, the name's text at 512."""
+
+    def __init__(self, text: bytes) -> None:
+        record = bytearray(4096)
+        struct.pack_into("PP", record, 64 + 16, 0xDEAD0000, 512)
+        record[512 : 512 + len(text)] = text
+        super().__init__(bytes(record))
+
+
+def test_mending_points_the_record_at_a_known_cpu():
+    import ctypes
+
+    memory = _Memory(b"generic\0")
+    assert pocl._replace(memory, 64, b"haswell")
+    (address,) = struct.unpack_from("P", memory.getvalue(), 64 + 24)
+    assert ctypes.string_at(address) == b"haswell"
+
+
+def test_mending_leaves_a_record_without_the_name_alone():
+    memory = _Memory(b"generic-ish\0")
+    before = memory.getvalue()
+    assert not pocl._replace(memory, 64, b"haswell")
+    assert memory.getvalue() == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "cpu"),
+    [
+        ("sse2", b"x86-64"),
+        ("avx2 fma bmi2 movbe f16c", b"haswell"),
+        ("avx2 fma bmi2 movbe f16c avx512f avx512bw avx512dq avx512vl", b"skylake-avx512"),
+        ("avx2 fma bmi2 sha_ni vaes clwb rdpid sse4a avx512f", b"znver3"),
+    ],
+)
+def test_the_widest_cpu_that_this_one_covers_is_taken(flags, cpu):
+    assert pocl._closest_cpu(set(flags.split())) == cpu

@@ -1,0 +1,54 @@
+"""The package as a whole: its public names, its import, its kernels."""
+
+import subprocess
+import sys
+
+import pytest
+
+import clra
+
+PUBLIC = (
+    "ConeBeamGeometry circular helix double_helix space_filling VolumeGrid Motion Scan read_scan "
+    "align reconstruct correct devices kernels ForwardProjector BackProjector"
+).split()
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_name_is_there_and_documented(name):
+    assert getattr(clra, name).__doc__
+    assert name in dir(clra)
+
+
+def test_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'aline'"):
+        _ = clra.aline
+
+
+def test_import_loads_no_opencl_and_prints_nothing():
+    code = (
+        "import sys, clra; "
+        "heavy = {'pyopencl', 'scipy', 'h5py', 'matplotlib', 'numpy'} & set(sys.modules); "
+        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_every_kernel_is_one_text_without_includes():
+    assert len(clra.kernels.names()) > 5
+    for name in clra.kernels.names():
+        text = clra.kernels.source(name)
+        assert "__kernel" in text
+        assert "#include" not in text
+
+
+def test_unknown_kernel_says_what_there_is():
+    with pytest.raises(ValueError, match=r"no kernel file 'x\.cl'; there are .*backproject\.cl"):
+        clra.kernels.source("x.cl")
+
+
+def test_every_kernel_builds_without_definitions(context):
+    from clra.ops import opencl
+
+    for name in clra.kernels.names():
+        assert opencl.build(context, name).all_kernels()
