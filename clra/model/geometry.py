@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from clra.model.checks import selection, vectors, whole
 
 if TYPE_CHECKING:
     from clra.model.motion import Motion
@@ -19,7 +20,7 @@ Floats = NDArray[np.float64]
 _DEGENERATE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class ConeBeamGeometry:
     """Source and panel of every view, in a right-handed frame fixed to the sample.
 
@@ -51,21 +52,34 @@ class ConeBeamGeometry:
     v: Floats
     shape: tuple[int, int]
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "shape", _panel_shape(self.shape))
-        for name in ("source", "detector", "u", "v"):
-            object.__setattr__(self, name, _vectors(name, getattr(self, name)))
+    def __init__(
+        self,
+        *,
+        source: ArrayLike,
+        detector: ArrayLike,
+        u: ArrayLike,
+        v: ArrayLike,
+        shape: tuple[int, int],
+    ) -> None:
+        object.__setattr__(self, "source", vectors("source", source, "views"))
+        object.__setattr__(self, "detector", vectors("detector", detector, "views"))
+        object.__setattr__(self, "u", vectors("u", u, "views"))
+        object.__setattr__(self, "v", vectors("v", v, "views"))
+        object.__setattr__(self, "shape", _panel_shape(shape))
         for name in ("detector", "u", "v"):
             found = len(getattr(self, name))
             if found != self.views:
-                raise ValueError(
-                    f"{name}: found {found} views, expected {self.views} as in source"
-                )
-        u, v = _norm(self.u), _norm(self.v)
+                raise ValueError(f"{name}: found {found} views, expected {self.views} as in source")
+        self._refuse_degenerate()
+
+    def _refuse_degenerate(self) -> None:
+        """Raise where a panel is no plane or its source lies in it."""
+        pitch_u, pitch_v = _norm(self.u), _norm(self.v)
         area = _norm(np.cross(self.u, self.v))
-        _refuse(area <= _DEGENERATE * u * v, "u and v: parallel or zero", "two directions")
-        reach = _norm(self.detector - self.source) + self.columns * u + self.rows * v
-        depth = np.abs(_dot(np.cross(self.u, self.v), self.detector - self.source)) / area
+        _refuse(area <= _DEGENERATE * pitch_u * pitch_v, "u and v: parallel or zero", "a plane")
+        ray = self.detector - self.source
+        reach = _norm(ray) + self.columns * pitch_u + self.rows * pitch_v
+        depth = np.abs(_dot(np.cross(self.u, self.v), ray)) / area
         _refuse(depth <= _DEGENERATE * reach, "source: in the panel's plane", "one off the plane")
 
     @property
@@ -159,9 +173,7 @@ class ConeBeamGeometry:
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]
         detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v
-        return ConeBeamGeometry(
-            source=self.source, detector=detector, u=u, v=v, shape=self.shape
-        )
+        return ConeBeamGeometry(source=self.source, detector=detector, u=u, v=v, shape=self.shape)
 
     def binned(self, factor: int = 2) -> ConeBeamGeometry:
         """Return the geometry of radiographs averaged over blocks of pixels.
@@ -174,7 +186,7 @@ class ConeBeamGeometry:
         factor : int
             Rows and columns of a block.
         """
-        factor = _positive("factor", factor)
+        factor = whole("factor", factor)
         rows, columns = self.rows // factor, self.columns // factor
         if not rows or not columns:
             raise ValueError(f"factor: found {factor}, expected at most {min(self.shape)}")
@@ -195,7 +207,7 @@ class ConeBeamGeometry:
         index : slice, int, integers or boolean mask (views,)
             Which views, in that order.
         """
-        chosen = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
+        chosen = selection(index)
         return ConeBeamGeometry(
             source=self.source[chosen],
             detector=self.detector[chosen],
@@ -260,24 +272,11 @@ class ConeBeamGeometry:
         shape : (int, int)
             Rows and columns of the panel.
         """
-        vectors = np.asarray(vectors, dtype=np.float64)
-        if vectors.ndim != 2 or vectors.shape[1] != 12:
-            raise ValueError(f"vectors: found shape {vectors.shape}, expected (views, 12)")
-        source, detector, u, v = np.split(vectors, 4, axis=1)
+        numbers = np.asarray(vectors, dtype=np.float64)
+        if numbers.ndim != 2 or numbers.shape[1] != 12:
+            raise ValueError(f"vectors: found shape {numbers.shape}, expected (views, 12)")
+        source, detector, u, v = np.split(numbers, 4, axis=1)
         return cls(source=source, detector=detector, u=u, v=v, shape=shape)
-
-
-def _vectors(name: str, value: ArrayLike) -> Floats:
-    """Check and copy one vector a view; read-only."""
-    array = np.array(value, dtype=np.float64, order="C")
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-        raise ValueError(f"{name}: found shape {array.shape}, expected (views, 3), views >= 1")
-    bad = ~np.isfinite(array).all(axis=1)
-    if bad.any():
-        view = int(np.argmax(bad))
-        raise ValueError(f"{name}: found {array[view]} in view {view}, expected finite numbers")
-    array.flags.writeable = False
-    return array
 
 
 def _panel_shape(shape: Any) -> tuple[int, int]:
@@ -286,18 +285,7 @@ def _panel_shape(shape: Any) -> tuple[int, int]:
         rows, columns = shape
     except (TypeError, ValueError):
         raise ValueError(f"shape: found {shape!r}, expected (rows, columns)") from None
-    return _positive("shape", rows), _positive("shape", columns)
-
-
-def _positive(name: str, value: Any) -> int:
-    """Check a whole number of at least one."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        raise TypeError(f"{name}: found {value!r}, expected a whole number") from None
-    if number < 1:
-        raise ValueError(f"{name}: found {number}, expected at least 1")
-    return number
+    return whole("shape", rows), whole("shape", columns)
 
 
 def _refuse(bad: NDArray[np.bool_], found: str, expected: str) -> None:

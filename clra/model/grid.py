@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.model.geometry import _positive
+from clra.model.checks import positive, whole
 
 if TYPE_CHECKING:
     from clra.model.geometry import ConeBeamGeometry
@@ -50,12 +50,10 @@ class VolumeGrid:
     def __post_init__(self) -> None:
         if np.shape(self.shape) != (3,):
             raise ValueError(f"shape: found {self.shape!r}, expected (nz, ny, nx)")
-        size = float(self.voxel_size)
-        if not (math.isfinite(size) and size > 0):
-            raise ValueError(f"voxel_size: found {size}, expected a positive length in mm")
+        size = positive("voxel_size", self.voxel_size)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
             raise ValueError(f"centre: found {self.centre!r}, expected finite (x, y, z) in mm")
-        nz, ny, nx = (_positive("shape", n) for n in self.shape)
+        nz, ny, nx = (whole("shape", n) for n in self.shape)
         x, y, z = (float(c) for c in self.centre)
         object.__setattr__(self, "shape", (nz, ny, nx))
         object.__setattr__(self, "voxel_size", size)
@@ -64,7 +62,7 @@ class VolumeGrid:
     def coordinates(self) -> tuple[Floats, Floats, Floats]:
         """Return the centres of the voxels along x, y and z, each 1-D [mm]."""
         x, y, z = (
-            middle + (np.arange(n) - (n - 1) / 2) * self.voxel_size
+            middle + (np.arange(n, dtype=np.float64) - (n - 1) / 2) * self.voxel_size
             for middle, n in zip(self.centre, self.shape[::-1], strict=True)
         )
         return x, y, z
@@ -88,7 +86,7 @@ class VolumeGrid:
 
         Voxels at the upper ends that fill no whole block are dropped.
         """
-        factor = _positive("factor", factor)
+        factor = whole("factor", factor)
         if factor > min(self.shape):
             raise ValueError(f"factor: found {factor}, expected at most {min(self.shape)}")
         nz, ny, nx = (n // factor for n in self.shape)
@@ -147,9 +145,10 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     low, high = _axis_range(geometry)
     across = max(1, math.ceil(2 * radius / voxel - _SLACK))
     planes = max(1, math.ceil((high - low) / voxel - _SLACK))
-    return VolumeGrid(
-        shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, 0.5 * (low + high))
-    )
+    middle = 0.5 * (low + high)
+    # A scan about z = 0 gets a grid about z = 0, not about what rounding left.
+    z = middle if abs(middle) > _SLACK * voxel else 0.0
+    return VolumeGrid(shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, z))
 
 
 def _circle_radius(geometry: ConeBeamGeometry) -> float:

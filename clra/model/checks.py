@@ -1,0 +1,74 @@
+"""Checks that several values share: each raises with the field, what was found and expected."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+def whole(name: str, value: Any) -> int:
+    """Check a whole number of at least one."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name}: found {value!r}, expected a whole number") from None
+    if number < 1:
+        raise ValueError(f"{name}: found {number}, expected at least 1")
+    return number
+
+
+def finite(name: str, value: Any) -> float:
+    """Check a finite number."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name}: found {number}, expected a finite number")
+    return number
+
+
+def positive(name: str, value: Any) -> float:
+    """Check a finite number above zero."""
+    number = float(value)
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"{name}: found {number}, expected a positive number")
+    return number
+
+
+def selection(index: slice | ArrayLike) -> slice | NDArray[Any]:
+    """Turn what selects views, a slice, integers or a mask, into an index that keeps the axis."""
+    if isinstance(index, slice):
+        return index
+    chosen = np.atleast_1d(np.asarray(index))
+    return chosen if chosen.size else chosen.astype(np.intp)
+
+
+def vectors(name: str, value: ArrayLike, each: str) -> Floats:
+    """Check and copy finite vectors (x, y, z), one for each of something; read-only."""
+    array = np.array(value, dtype=np.float64, order="C")
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise ValueError(f"{name}: found shape {array.shape}, expected ({each}, 3), at least one")
+    return _finite_array(name, array, each)
+
+
+def column(name: str, value: ArrayLike, each: str) -> Floats:
+    """Check and copy finite numbers, one for each of something; read-only."""
+    array = np.array(value, dtype=np.float64, order="C")
+    if array.ndim != 1 or not len(array):
+        raise ValueError(f"{name}: found shape {array.shape}, expected ({each},), at least one")
+    return _finite_array(name, array, each)
+
+
+def _finite_array(name: str, array: Floats, each: str) -> Floats:
+    bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise ValueError(
+            f"{name}: found {array[first]} at {first} of the {each}, expected finite numbers"
+        )
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,140 @@
+"""The apparent motion of each radiograph: a shift and a magnification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clra.model.checks import column, selection, whole
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, init=False, eq=False, repr=False)
+class Motion:
+    """Shift and magnification of each view.
+
+    A feature that the ideal geometry puts at pixel q appears at
+    ``c + magnification (q - c) + shift``, c the panel's centre, q and shift ordered (u, v).
+
+    Parameters
+    ----------
+    shift_u : array_like, (views,)
+        Shift toward higher columns [pixel of the full-resolution panel].
+    shift_v : array_like, (views,)
+        Shift toward higher rows [pixel of the full-resolution panel].
+    magnification : array_like, (views,), optional
+        Above 1 where the radiograph appears larger; all 1 if not given.
+
+    Raises
+    ------
+    ValueError
+        If lengths disagree, a number is not finite or a magnification is not positive.
+    """
+
+    shift_u: Floats
+    shift_v: Floats
+    magnification: Floats
+
+    def __init__(
+        self, *, shift_u: ArrayLike, shift_v: ArrayLike, magnification: ArrayLike | None = None
+    ) -> None:
+        if magnification is None:
+            magnification = np.ones(np.shape(shift_u))
+        object.__setattr__(self, "shift_u", column("shift_u", shift_u, "views"))
+        object.__setattr__(self, "shift_v", column("shift_v", shift_v, "views"))
+        object.__setattr__(self, "magnification", column("magnification", magnification, "views"))
+        for name in ("shift_v", "magnification"):
+            found = len(getattr(self, name))
+            if found != self.views:
+                raise ValueError(
+                    f"{name}: found {found} views, expected {self.views} as in shift_u"
+                )
+        if self.magnification.min() <= 0:
+            raise ValueError(
+                f"magnification: found {self.magnification.min()}, expected positive numbers"
+            )
+
+    @classmethod
+    def identity(cls, views: int) -> Motion:
+        """Return no motion of `views` views."""
+        still = np.zeros(whole("views", views))
+        return cls(shift_u=still, shift_v=still)
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return len(self.shift_u)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return self.views
+
+    def __eq__(self, other: object) -> bool:
+        """Compare exactly, number by number."""
+        if not isinstance(other, Motion):
+            return NotImplemented
+        return np.array_equal(self._table(), other._table())
+
+    def __repr__(self) -> str:
+        """Summarise the ranges."""
+        u, v, m = ((a.min(), a.max()) for a in self._table())
+        return (
+            f"Motion({self.views} views, shift_u {u[0]:.4g} to {u[1]:.4g} pixel, "
+            f"shift_v {v[0]:.4g} to {v[1]:.4g} pixel, magnification {m[0]:.6g} to {m[1]:.6g})"
+        )
+
+    def then(self, residual: Motion) -> Motion:
+        """Return this motion followed by `residual`.
+
+        Parameters
+        ----------
+        residual : Motion
+            What is still to be moved once this motion is in the geometry, as a registration of
+            measured with re-projected radiographs finds it.
+        """
+        if residual.views != self.views:
+            raise ValueError(f"residual: found {residual.views} views, expected {self.views}")
+        m = residual.magnification
+        return Motion(
+            shift_u=m * self.shift_u + residual.shift_u,
+            shift_v=m * self.shift_v + residual.shift_v,
+            magnification=m * self.magnification,
+        )
+
+    def inverse(self) -> Motion:
+        """Return the motion that undoes this one: ``motion.then(motion.inverse())`` is none."""
+        m = self.magnification
+        return Motion(shift_u=-self.shift_u / m, shift_v=-self.shift_v / m, magnification=1 / m)
+
+    def normalised(self) -> Motion:
+        """Return the motion with its magnifications divided by their geometric mean.
+
+        That mean cannot be told from the size of the sample.
+        """
+        return Motion(
+            shift_u=self.shift_u,
+            shift_v=self.shift_v,
+            magnification=self.magnification / np.exp(np.mean(np.log(self.magnification))),
+        )
+
+    def subset(self, index: slice | ArrayLike) -> Motion:
+        """Return the motion of some of the views.
+
+        Parameters
+        ----------
+        index : slice, int, integers or boolean mask (views,)
+            Which views, in that order.
+        """
+        chosen = selection(index)
+        return Motion(
+            shift_u=self.shift_u[chosen],
+            shift_v=self.shift_v[chosen],
+            magnification=self.magnification[chosen],
+        )
+
+    def _table(self) -> Floats:
+        """All three, (3, views)."""
+        return np.stack([self.shift_u, self.shift_v, self.magnification])

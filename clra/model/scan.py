@@ -1,0 +1,176 @@
+"""A scan: radiographs, the geometry they were taken with, and what is known about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clra.model.checks import selection
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.motion import Motion
+
+KINDS = ("line-integrals", "transmission")
+
+# Transmission below which the logarithm is cut off: a dead or fully shadowed pixel must not
+# become infinite. exp(-13.8) is far below what a real detector resolves.
+_DARKEST = 1e-6
+
+
+class Projections(Protocol):
+    """Radiographs (views, rows, columns): an array, a memory map, an HDF5 dataset or alike."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Views, rows, columns."""
+        ...
+
+    def __getitem__(self, views: slice, /) -> Any:
+        """Return some consecutive views as an array."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scan:
+    """Radiographs with their geometry; pixels are read only when asked for.
+
+    Parameters
+    ----------
+    projections : array or array-like object, (views, rows, columns)
+        Anything with ``shape`` whose slices along the first axis are arrays: numpy, a memory map,
+        an HDF5 dataset.
+    geometry : ConeBeamGeometry
+        Of the same views and panel.
+    kind : {"line-integrals", "transmission"}
+        What the pixels are: -log(I / I0), or I / I0.
+    name : str
+        For messages and reports.
+    truth : Motion, optional
+        The motion that a simulation put in.
+    mask : array_like of bool, (rows, columns), optional
+        True where the panel's pixels may be used.
+
+    Raises
+    ------
+    ValueError
+        If projections, geometry, truth or mask disagree, or `kind` is none of the two.
+    """
+
+    projections: Projections
+    geometry: ConeBeamGeometry
+    kind: str = "line-integrals"
+    name: str = field(default="scan", kw_only=True)
+    truth: Motion | None = field(default=None, kw_only=True)
+    mask: NDArray[np.bool_] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        expected = (self.geometry.views, *self.geometry.shape)
+        found = tuple(self.projections.shape)
+        if found != expected:
+            raise ValueError(
+                f"{self.name}: projections: found shape {found}, "
+                f"expected {expected} as in the geometry"
+            )
+        if self.kind not in KINDS:
+            raise ValueError(f"{self.name}: kind: found {self.kind!r}, expected one of {KINDS}")
+        if self.truth is not None and self.truth.views != self.views:
+            raise ValueError(
+                f"{self.name}: truth: found {self.truth.views} views, expected {self.views}"
+            )
+        if self.mask is not None:
+            mask = np.array(self.mask, dtype=np.bool_)
+            if mask.shape != self.geometry.shape or not mask.any():
+                raise ValueError(
+                    f"{self.name}: mask: found shape {mask.shape} with {mask.sum()} pixels to use, "
+                    f"expected shape {self.geometry.shape} and at least one"
+                )
+            mask.flags.writeable = False
+            object.__setattr__(self, "mask", mask)
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return self.geometry.views
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Views, rows, columns."""
+        return (self.geometry.views, *self.geometry.shape)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return self.views
+
+    def __repr__(self) -> str:
+        """Summarise name, kind and geometry."""
+        return f"Scan({self.name!r}, {self.kind}, {self.geometry!r})"
+
+    def read(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Read the line integrals of the views `start` to `stop - 1`.
+
+        Parameters
+        ----------
+        start, stop : int
+            Range of views, 0 <= start <= stop <= views.
+
+        Returns
+        -------
+        ndarray of float32, (stop - start, rows, columns)
+            C-contiguous; of a transmission, -log(max(I / I0, 1e-6)). It may share its memory
+            with the projections: do not write to it.
+
+        Raises
+        ------
+        ValueError
+            If the range is wrong or a pixel is not finite.
+        """
+        if not 0 <= start <= stop <= self.views:
+            raise ValueError(
+                f"{self.name}: views: found {start}:{stop}, expected within 0:{self.views}"
+            )
+        pixels = np.ascontiguousarray(self.projections[start:stop], dtype=np.float32)
+        if self.kind == "transmission":
+            pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
+        # One such pixel would spread over the whole volume through filter and back-projection.
+        finite = np.isfinite(pixels).all(axis=(1, 2))
+        if not finite.all():
+            view = start + int(np.argmin(finite))
+            raise ValueError(f"{self.name}: view {view}: found a pixel that is no finite number")
+        return pixels
+
+    def subset(self, index: slice | ArrayLike) -> Scan:
+        """Return the scan of some of the views; nothing is read.
+
+        Parameters
+        ----------
+        index : slice, int, integers or boolean mask (views,)
+            Which views, in that order.
+        """
+        chosen = selection(index)
+        return Scan(
+            _Selection(self.projections, np.arange(self.views)[chosen]),
+            self.geometry.subset(index),
+            self.kind,
+            name=self.name,
+            truth=None if self.truth is None else self.truth.subset(index),
+            mask=self.mask,
+        )
+
+
+class _Selection:
+    """Some views of other projections, read in runs of consecutive ones."""
+
+    def __init__(self, projections: Projections, views: NDArray[np.int_]) -> None:
+        self._projections = projections
+        self._views = views
+        self.shape = (len(views), *projections.shape[1:])
+
+    def __getitem__(self, index: slice) -> NDArray[Any]:
+        views = self._views[index]
+        runs = np.split(views, np.flatnonzero(np.diff(views) != 1) + 1)
+        if not len(views):
+            return np.asarray(self._projections[0:0])
+        parts = [np.asarray(self._projections[int(r[0]) : int(r[-1]) + 1]) for r in runs]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)

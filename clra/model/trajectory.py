@@ -1,0 +1,260 @@
+"""Trajectories of the source about the sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.model.checks import finite, positive, whole
+from clra.model.geometry import ConeBeamGeometry
+
+Floats = NDArray[np.float64]
+
+PAPER: Mapping[str, Any] = MappingProxyType(
+    {
+        "z_step": 0.001641,
+        "source_to_axis": 4.3627,
+        "source_to_detector": 436.27,
+        "pixel_size": 0.4544,
+        "shape": (928, 512),
+    }
+)
+"""The simulations of the paper, section 2: ``space_filling(3456, **PAPER)`` and
+``helix(3456, angle_step=math.radians(0.5), **PAPER)``. The panel's shape is not in the paper; this
+one sees the phantom's whole width."""
+
+# The angle of the paper's space-filling trajectory, "about 15.3 degrees".
+_NEAR = math.radians(15.3)
+
+
+def circular(
+    views: int,
+    *,
+    source_to_axis: float,
+    source_to_detector: float,
+    pixel_size: float,
+    shape: tuple[int, int],
+    start: float = 0.0,
+    arc: float = 2 * math.pi,
+) -> ConeBeamGeometry:
+    """Return a circle, or an arc of one.
+
+    At angle b the source is at ``source_to_axis (sin b, -cos b, 0)``, u points along
+    (cos b, sin b, 0) and v along +z, as in all trajectories here.
+
+    Parameters
+    ----------
+    views : int
+        Number of views; view i is at ``start + i arc / views``.
+    source_to_axis, source_to_detector : float
+        Distances [mm].
+    pixel_size : float
+        Edge of a pixel of the panel itself, not scaled to the axis [mm].
+    shape : (int, int)
+        Rows and columns of the panel.
+    start, arc : float
+        First angle and angle covered [rad].
+    """
+    views = whole("views", views)
+    angles = finite("start", start) + np.arange(views, dtype=np.float64) * (
+        finite("arc", arc) / views
+    )
+    return _around(angles, np.zeros(views), source_to_axis, source_to_detector, pixel_size, shape)
+
+
+def helix(
+    views: int,
+    *,
+    angle_step: float,
+    z_step: float,
+    source_to_axis: float,
+    source_to_detector: float,
+    pixel_size: float,
+    shape: tuple[int, int],
+    start: float = 0.0,
+) -> ConeBeamGeometry:
+    """Return a helix about the z axis, centred on z = 0.
+
+    Parameters
+    ----------
+    views : int
+        Number of views; view i is at the height ``(i - (views - 1) / 2) z_step``.
+    angle_step : float
+        Angle from one view to the next [rad].
+    z_step : float
+        Rise from one view to the next; negative downward [mm].
+    source_to_axis, source_to_detector, pixel_size, shape, start
+        As in `circular`.
+    """
+    views = whole("views", views)
+    angles = finite("start", start) + np.arange(views, dtype=np.float64) * finite(
+        "angle_step", angle_step
+    )
+    return _around(
+        angles, _heights(views, z_step), source_to_axis, source_to_detector, pixel_size, shape
+    )
+
+
+def double_helix(
+    views_per_helix: int,
+    *,
+    angle_step: float,
+    z_step: float,
+    source_to_axis: float,
+    source_to_detector: float,
+    pixel_size: float,
+    shape: tuple[int, int],
+    second: str = "half-turn",
+    start: float = 0.0,
+) -> ConeBeamGeometry:
+    """Return a helix followed by a second one along which the stage travels back.
+
+    Parameters
+    ----------
+    views_per_helix : int
+        Number of views N of each helix; there are 2 N views.
+    angle_step, z_step
+        Of the first helix, as in `helix`.
+    source_to_axis, source_to_detector, pixel_size, shape, start
+        As in `circular`.
+    second : {"half-turn", "return"}
+        "half-turn": the first helix turned by half a turn and followed backwards; view N + k is
+        at the height of view N - 1 - k and opposite to it. Both helices have the same hand and
+        interleave. "return": the rotation goes on while the travel reverses; view N + k is at the
+        height of view N - 1 - k and at the angle ``start + (N + k) angle_step``. The second helix
+        has the opposite hand.
+    """
+    views = whole("views_per_helix", views_per_helix)
+    angles = np.arange(views, dtype=np.float64) * finite("angle_step", angle_step)
+    if second == "half-turn":
+        later = angles[::-1] + math.pi
+    elif second == "return":
+        later = angles + views * angle_step
+    else:
+        raise ValueError(f"second: found {second!r}, expected 'half-turn' or 'return'")
+    z = _heights(views, z_step)
+    return _around(
+        finite("start", start) + np.concatenate([angles, later]),
+        np.concatenate([z, z[::-1]]),
+        source_to_axis,
+        source_to_detector,
+        pixel_size,
+        shape,
+    )
+
+
+def space_filling(
+    views: int,
+    *,
+    z_step: float,
+    source_to_axis: float,
+    source_to_detector: float,
+    pixel_size: float,
+    shape: tuple[int, int],
+    angle_step: float | None = None,
+    start: float = 0.0,
+) -> ConeBeamGeometry:
+    """Return a space-filling trajectory: a helix of so large an angle step that it is a lattice.
+
+    Parameters
+    ----------
+    views, z_step, source_to_axis, source_to_detector, pixel_size, shape, start
+        As in `helix`.
+    angle_step : float, optional
+        Angle from one view to the next [rad]; if not given, `lattice_angle`.
+    """
+    if angle_step is None:
+        angle_step = lattice_angle(source_to_axis, z_step)
+    return helix(
+        views,
+        angle_step=angle_step,
+        z_step=z_step,
+        source_to_axis=source_to_axis,
+        source_to_detector=source_to_detector,
+        pixel_size=pixel_size,
+        shape=shape,
+        start=start,
+    )
+
+
+def lattice_angle(source_to_axis: float, z_step: float, near: float = _NEAR) -> float:
+    """Return the angle step for which the source positions are spread most evenly.
+
+    On the unrolled cylinder the positions are the lattice spanned by (R angle, z_step) and
+    (2 pi R, 0). The angle is the local maximiser, nearest to `near`, of the shortest distance
+    min_n |(R wrap(n angle), n z_step)|. Every local maximum lies between the square and the
+    hexagonal lattice (0.93 to 1 of the latter's distance), so the nearest one is good; a rounded
+    angle need not be. For `PAPER` that is 15.264 degrees with 0.930; 15.300 has 0.45.
+
+    Parameters
+    ----------
+    source_to_axis : float
+        Radius R [mm].
+    z_step : float
+        Rise from one view to the next [mm].
+    near : float
+        Angle to start from, between 0 and pi [rad].
+    """
+    rise = abs(finite("z_step", z_step)) / positive("source_to_axis", source_to_axis)
+    if rise == 0:
+        raise ValueError("z_step: found 0, expected a rise: give angle_step for a circle")
+    if not 0 < near < math.pi:
+        raise ValueError(f"near: found {near}, expected an angle between 0 and pi")
+    hexagonal = math.sqrt(4 * math.pi * rise / math.sqrt(3))
+    # No neighbour farther along z than the hexagonal distance can be the nearest.
+    steps = np.arange(1, math.ceil(hexagonal / rise) + 1)
+
+    def shortest(angles: Floats) -> Floats:
+        turns = np.multiply.outer(angles, steps / (2 * math.pi))
+        around = 2 * math.pi * (turns - np.rint(turns))
+        return np.asarray(np.hypot(around, steps * rise).min(axis=1))
+
+    # Fine enough that the outermost neighbour moves by a small part of the distance sought.
+    pace = min(0.02 * hexagonal / len(steps), 0.01)
+    reach = 64
+    while True:
+        angles = near + np.arange(-reach, reach + 1, dtype=np.float64) * pace
+        distance = shortest(angles)
+        inner = distance[1:-1]
+        peaks = 1 + np.flatnonzero((inner >= distance[:-2]) & (inner > distance[2:]))
+        # Until the window holds a peak; it cannot outgrow a turn, as pi is always an extremum.
+        if len(peaks):
+            break
+        reach *= 2
+    low, _, high = angles[peaks[np.abs(angles[peaks] - near).argmin()] + np.array([-1, 0, 1])]
+    for _ in range(60):
+        third = (high - low) / 3
+        left, right = shortest(np.array([low + third, high - third]))
+        low, high = (low + third, high) if left < right else (low, high - third)
+    return float(0.5 * (low + high))
+
+
+def _heights(views: int, z_step: float) -> Floats:
+    return (np.arange(views, dtype=np.float64) - (views - 1) / 2) * finite("z_step", z_step)
+
+
+def _around(
+    angles: Floats,
+    z: Floats,
+    source_to_axis: float,
+    source_to_detector: float,
+    pixel_size: float,
+    shape: tuple[int, int],
+) -> ConeBeamGeometry:
+    """Geometry of an ideal stage at each angle and height."""
+    radius = positive("source_to_axis", source_to_axis)
+    beyond = positive("source_to_detector", source_to_detector) - radius
+    pixel = positive("pixel_size", pixel_size)
+    cos, sin, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
+    return ConeBeamGeometry(
+        source=np.stack([radius * sin, -radius * cos, z], axis=1),
+        detector=np.stack([-beyond * sin, beyond * cos, z], axis=1),
+        u=pixel * np.stack([cos, sin, zero], axis=1),
+        v=pixel * np.stack([zero, zero, zero + 1], axis=1),
+        shape=shape,
+    )

@@ -1,0 +1,55 @@
+"""Schedules as text, and the stop rule."""
+
+import numpy as np
+import pytest
+
+from clra.model.schedule import Stage, converged, level_name, parse_schedule, update_size
+
+
+@pytest.mark.parametrize(
+    ("text", "stages"),
+    [
+        ("1QR-1HR", [(4, 1, 1), (2, 1, 1)]),
+        ("2qr-12hr", [(4, 2, 2), (2, 12, 12)]),
+        ("4FR", [(1, 4, 4)]),
+        ("2ER-1QR-1HR-3FR", [(8, 2, 2), (4, 1, 1), (2, 1, 1), (1, 3, 3)]),
+        ("auto", [(4, None, 6), (2, 1, 1)]),
+    ],
+)
+def test_text_becomes_stages(text, stages):
+    assert parse_schedule(text) == tuple(Stage(*stage) for stage in stages)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "QR", "0QR", "1XR", "1QR-", "-1QR", "1QR 1HR", "1QR,1HR", "1.5QR", "100FR", "Auto?"],
+)
+def test_bad_text_says_what_a_schedule_looks_like(text):
+    with pytest.raises(ValueError, match=r"schedule: found .* such as '1QR-1HR'"):
+        parse_schedule(text)
+
+
+def test_stages_print_as_they_are_written():
+    assert "-".join(str(stage) for stage in parse_schedule("2ER-1QR-3FR")) == "2ER-1QR-3FR"
+    assert [str(stage) for stage in parse_schedule("auto")] == ["QR", "1HR"]
+    assert [level_name(level) for level in (1, 2, 4, 8)] == ["FR", "HR", "QR", "ER"]
+    with pytest.raises(ValueError, match="level: found 3"):
+        level_name(3)
+
+
+def test_small_updates_have_converged():
+    small = np.full(9, -0.09)
+    assert converged(small, small)
+    assert not converged(np.full(9, 0.11), np.full(9, 0.11))
+    one_large = small.copy()
+    one_large[4] = -0.51
+    assert not converged(small, one_large)
+
+
+def test_updates_that_no_longer_shrink_have_converged():
+    u, v = np.full(5, 0.3), np.full(5, -0.4)
+    median, largest = update_size(u, v)
+    assert (median, largest) == pytest.approx((0.35, 0.4))
+    assert converged(u, v, median)
+    assert converged(u, v, 0.3)
+    assert not converged(u, v, 0.36)
