@@ -1,0 +1,1 @@
+"""Files: scans, volumes, motions and geometries in and out."""

@@ -1,0 +1,128 @@
+"""Output files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from clra.io.errors import OutputError
+
+# HDF5 tells the system's errno only inside its message.
+_HDF5_ERRNO = re.compile(r"errno = (\d+)")
+
+# Bytes written and taken back before the file is begun. No quota tells how much it leaves, and HDF5
+# 2.0 crashes the process where its header, far smaller than this, does not fit.
+_HEADER = 4 << 20
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str], size: int = 0) -> Iterator[Path]:
+    """Yield a temporary path beside `path` that is renamed to it once all went well.
+
+    The file is flushed to the disk and renamed at the end of the block; whatever the block raises,
+    Ctrl-C included, removes it and leaves what stood at `path` before.
+
+    Parameters
+    ----------
+    path : path-like
+        Where the file is to appear; a link is followed.
+    size : int
+        Bytes that will be written: refused at once where the disk lacks them.
+
+    Yields
+    ------
+    Path
+        An empty file in the same folder: open it for writing.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be made, written or renamed.
+    """
+    target = _target(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        temporary.touch()
+        _check_room(temporary, size)
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, target)
+        _flush(target.parent)
+    except (OSError, RuntimeError) as error:
+        raise _explained(path, error) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def ensure_writable(path: str | os.PathLike[str]) -> None:
+    """Check before a long computation that `path` can be written; nothing is left behind.
+
+    Parameters
+    ----------
+    path : path-like
+        Where a file is to appear later.
+
+    Raises
+    ------
+    OutputError
+        If it cannot.
+    """
+    target = _target(path)
+    probe = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise _explained(path, error) from error
+
+
+def _target(path: str | os.PathLike[str]) -> Path:
+    """Follow `path` to its file; refuse what a rename must not replace: folders, devices, pipes."""
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        kind = "a folder" if target.is_dir() else "no regular file"
+        raise OutputError(f"cannot write {os.fspath(path)}: it is {kind}; give a file's name")
+    return target
+
+
+def _check_room(temporary: Path, size: int) -> None:
+    """Raise where the disk lacks `size` bytes: better now than after hours of writing."""
+    usage = shutil.disk_usage(temporary.parent)
+    # Some network file systems report nothing at all.
+    if usage.total and usage.free < size:
+        found = f"{usage.free / 1e9:.3g} GB free of {size / 1e9:.3g} GB wanted"
+        raise OSError(errno.ENOSPC, found)
+    with open(temporary, "wb") as file:
+        file.write(bytes(min(size, _HEADER)))
+        file.flush()
+        os.fsync(file.fileno())
+        file.truncate(0)
+
+
+def _flush(path: Path) -> None:
+    """Wait until the disk has it: a rename may otherwise outlive the bytes in a power cut."""
+    if path.is_dir() and os.name == "nt":
+        return  # Windows opens no folders
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _explained(path: str | os.PathLike[str], error: Exception) -> Exception:
+    """Return the error to raise in place of `error`."""
+    told = _HDF5_ERRNO.search(str(error))
+    if isinstance(error, OutputError) or (isinstance(error, RuntimeError) and not told):
+        return error
+    if told:
+        return OutputError.writing(path, int(told[1]), "")
+    number = error.errno if isinstance(error, OSError) else None
+    reason = getattr(error, "strerror", None) or str(error)
+    return OutputError.writing(path, number, reason)
