@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# Tikhonov weight relative to the squared norm of the differences: at a tenth of it random motions
+# Tikhonov weight relative to the squared length of each difference: at a tenth of it random motions
 # make the extrapolation noisy, at ten times it slow modes stay slow.
 _DAMPING = 1e-3
 # An extrapolated step longer than this many plain ones is not believed.
@@ -54,8 +54,12 @@ class Anderson:
             return x + f
         dx = np.diff(np.stack(self._points, axis=-1).reshape(x.size, -1))
         df = np.diff(np.stack(self._steps, axis=-1).reshape(x.size, -1))
-        normal = df.T @ df
-        normal += _DAMPING * np.trace(normal) * np.eye(len(normal))
+        # Columns of one length: else the damping that the first, long difference needs would
+        # drown the last, short ones, which are what slow modes are seen in.
+        length = np.linalg.norm(df, axis=0)
+        length[length == 0] = 1.0
+        dx, df = dx / length, df / length
+        normal = df.T @ df + _DAMPING * np.eye(df.shape[1])
         step = f - ((dx + df) @ np.linalg.solve(normal, df.T @ f.ravel())).reshape(f.shape)
         if np.abs(step).max() > _LONGEST * max(float(np.abs(f).max()), self.floor):
             return x + f

@@ -92,3 +92,8 @@ def test_confidence_of_another_length(tmp_path: Path, motion: Motion) -> None:
     with pytest.raises(ValueError, match=r"confidence: found shape \(3,\), expected \(9,\)"):
         write_motion_file(tmp_path / "motion.h5", motion, confidence=np.ones(3))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_motion_saves_and_loads_itself(tmp_path: Path, motion: Motion) -> None:
+    motion.save(tmp_path / "motion.h5")
+    assert Motion.load(tmp_path / "motion.h5") == motion

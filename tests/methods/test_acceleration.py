@@ -16,9 +16,9 @@ def _iterate(memory, steps, gains, start):
 
 def test_slow_modes_converge_that_a_plain_iteration_leaves():
     gains = np.repeat([0.95, 0.5, 0.05], [40, 10, 3])
-    start = np.random.default_rng(0).uniform(-3, 3, gains.size)
-    plain, accelerated = (_iterate(memory, 6, gains, start) for memory in (0, 3))
-    assert plain > 0.7 * np.abs(start[-3:]).max()  # (1 - 0.05)^6 = 0.735
+    start = np.random.default_rng(0).uniform(-1, 1, gains.size)
+    plain, accelerated = (_iterate(memory, 7, gains, start) for memory in (0, 3))
+    assert plain > 0.69 * np.abs(start[-3:]).max()  # (1 - 0.05)^7 = 0.698
     assert accelerated < 0.1 * plain
 
 

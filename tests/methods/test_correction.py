@@ -30,7 +30,7 @@ def _smooth(geometry):
     """Radiographs without edges: a stack of many thin shells is close to a bump."""
     radii = np.linspace(1.0, 6.0, 40)
     bump = Ellipsoids(
-        centres=np.tile((0.3, -0.2, 0.4), (40, 1)), radii=radii, attenuation=np.full(40, 0.01)
+        centres=np.tile((0.3, -0.2, 0.4), (40, 1)), semi_axes=radii, attenuation=np.full(40, 0.01)
     )
     return bump.line_integrals(geometry)
 
