@@ -1,0 +1,67 @@
+"""A kernel that is one step of an operator, launched with Python's own numbers."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from clra.ops import opencl
+
+
+class Step:
+    """A kernel object with its work-group size.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where to build it.
+    file, function : str
+        Kernel file and kernel.
+    local : sequence of int
+        Work-group wanted; halved until the device allows it.
+    defines : mapping, optional
+        Preprocessor definitions.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        file: str,
+        function: str,
+        local: Sequence[int],
+        defines: Mapping[str, object] | None = None,
+    ) -> None:
+        self._kernel = opencl.kernel(context, file, function, defines)
+        self._local = opencl.work_group_size(self._kernel, opencl.device_of(context), local)
+
+    def __call__(
+        self,
+        queue: cl.CommandQueue,
+        size: Sequence[int],
+        *arguments: Array | int | float,
+        wait_for: Sequence[cl.Event] | None = None,
+    ) -> cl.Event:
+        """Run over `size`, rounded up to whole work-groups.
+
+        An array is given as buffer and offset, an int as int32, a float as float32.
+        """
+        values: list[Any] = []
+        for argument in arguments:
+            if isinstance(argument, Array):
+                values.extend(opencl.buffer_argument(argument))
+            elif isinstance(argument, float):
+                values.append(np.float32(argument))
+            else:
+                values.append(np.int32(argument))
+        return self._kernel(
+            queue, opencl.global_size(size, self._local), self._local, *values, wait_for=wait_for
+        )
+
+
+def to_device(context: cl.Context, values: Any, dtype: Any = np.float32) -> Array:
+    """Copy of host values in an array of the context; takes no queue."""
+    host = np.ascontiguousarray(values, dtype)
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+    return Array(context, host.shape, host.dtype, data=cl.Buffer(context, flags, hostbuf=host))
