@@ -63,6 +63,8 @@ def ramp_fbp(
     context, queue = stream.context, stream.queue
     row_weight = taper(geometry.rows, fade)
     ramp = RampFilter(context, geometry, row_weight=row_weight, window=window)
+    coverage = Coverage(context, geometry, grid, row_weight)
+    coverage.compute(queue)
     volume = Volume(stream, grid)
     slabs = volume.slabs
     seeing = [views_that_see(geometry, slab) for slab in slabs]
@@ -87,9 +89,8 @@ def ramp_fbp(
                     previous.wait()
                 previous = event
                 done += views.stop - views.start
-        coverage = Coverage(context, geometry, slab, row_weight)
-        coverage.compute(queue)
-        coverage.normalise(queue, attenuation, scale=math.pi, volume_order="yxz")
+        first = volume.planes[index].start
+        coverage.normalise(queue, attenuation, math.pi, first=first, volume_order="yxz")
         volume.put(index, attenuation)
     queue.finish()
     stream.report(stage, total, total)

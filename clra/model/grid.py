@@ -141,7 +141,12 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     if magnified.min() <= 0:
         raise ValueError(f"view {int(magnified.argmin())}: the axis lies behind the source")
     voxel = float(np.median(np.linalg.norm(geometry.u, axis=1) * magnified))
-    radius = _circle_radius(geometry)
+    nearest = field_radii(geometry)
+    radius = float(nearest.min())
+    if not radius > 0:
+        raise ValueError(
+            f"view {int(nearest.argmin())} does not see the rotation axis: give a grid"
+        )
     low, high = _axis_range(geometry)
     across = max(1, math.ceil(2 * radius / voxel - _SLACK))
     planes = max(1, math.ceil((high - low) / voxel - _SLACK))
@@ -151,8 +156,19 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     return VolumeGrid(shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, z))
 
 
-def _circle_radius(geometry: ConeBeamGeometry) -> float:
-    """Radius of the circle about the axis, at the source's height, that every view sees [mm]."""
+def field_radii(geometry: ConeBeamGeometry) -> Floats:
+    """Radius of the circle about the axis that each view sees, at the source's height.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the scan.
+
+    Returns
+    -------
+    ndarray, (views,)
+        [mm]; negative for a view that does not see the axis.
+    """
     nearest = np.full(geometry.views, np.inf)
     for side in (-1, 1):
         edge = geometry.detector + side * geometry.columns / 2 * geometry.u - geometry.source
@@ -161,10 +177,7 @@ def _circle_radius(geometry: ConeBeamGeometry) -> float:
         horizontal = np.linalg.norm(normal[:, :2], axis=1)
         distance = -np.sum(normal[:, :2] * geometry.source[:, :2], axis=1) * inward / horizontal
         nearest = np.minimum(nearest, distance)
-    view = int(nearest.argmin())
-    if not nearest[view] > 0:
-        raise ValueError(f"view {view} does not see the rotation axis: give a grid")
-    return float(nearest[view])
+    return nearest
 
 
 def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:

@@ -150,8 +150,13 @@ class Volume:
         self._parts: list[cl.array.Array | Floats | None] = [None] * len(self._planes)
 
     @property
+    def planes(self) -> list[slice]:
+        """Planes of the grid in each slab, bottom to top."""
+        return list(self._planes)
+
+    @property
     def slabs(self) -> list[VolumeGrid]:
-        """Grid of each slab, bottom to top."""
+        """Grid of each slab."""
         return [self.grid.slab(planes.start, planes.stop) for planes in self._planes]
 
     def put(self, index: int, part: cl.array.Array) -> None:

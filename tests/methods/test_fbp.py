@@ -65,8 +65,8 @@ def test_motion_is_absorbed():
         shift_v=rng.uniform(-2, 2, 40),
         magnification=rng.uniform(0.99, 1.01, 40),
     )
-    moved = clra.Scan(spheres.line_integrals(geometry.with_motion(motion)), geometry)
-    still = clra.Scan(spheres.line_integrals(geometry), geometry)
+    moved = clra.Scan(spheres.line_integrals(geometry.with_motion(motion), oversample=4), geometry)
+    still = clra.Scan(spheres.line_integrals(geometry, oversample=4), geometry)
     expected = clra.reconstruct(still)
     scale = np.abs(expected).max()
     rms = np.sqrt(np.mean((clra.reconstruct(moved, motion=motion) - expected) ** 2)) / scale

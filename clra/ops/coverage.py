@@ -1,0 +1,195 @@
+"""How many views see each voxel, and volumes divided by that number."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import ArrayLike
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid, field_radii
+from clra.ops import opencl
+from clra.ops.steps import Step, to_device
+
+# Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
+# rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
+# twentieth of a back-projection.
+_ACROSS, _ALONG = 8, 4
+# A voxel with less than this part of the most views that see the axis is set to zero: a handful of
+# views gives streaks, not a reconstruction.
+_LEAST = 0.02
+# Part of the views that may fail to see a voxel to the side. All views have to, but a few that are
+# moved far must not narrow the field of view.
+_BLIND = 0.02
+_HEIGHTS = 256
+
+
+class Coverage:
+    """W(x): the sum, over the views that see x, of the weight of the row that x falls on.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where the arrays live.
+    geometry : ConeBeamGeometry
+        Of the views.
+    grid : VolumeGrid
+        Of the volume.
+    row_weight : array_like, (rows,)
+        By which the rows of each projection were multiplied.
+
+    Raises
+    ------
+    ValueError
+        If there is not a weight for each row.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        row_weight: ArrayLike,
+    ) -> None:
+        weights = np.asarray(row_weight, np.float64)
+        if weights.shape != (geometry.rows,):
+            raise ValueError(f"row_weight: found {weights.shape}, expected ({geometry.rows},)")
+        self._context = context
+        self._grid = grid
+        self._views = geometry.views
+        # One row or column is as good as two alike.
+        self._panel = (max(geometry.columns, 2), max(geometry.rows, 2))
+        nz, ny, nx = grid.shape
+        self._coarse = (-(-nx // _ACROSS), -(-ny // _ACROSS), -(-nz // _ALONG))
+        self._matrices = to_device(context, self._coarse_matrices(geometry))
+        self._weights = to_device(context, np.resize(weights, self._panel[1]))
+        self._seen = Array(context, self._coarse[1::-1] + self._coarse[2:], np.float32)
+        self._least = _LEAST * _most_views(geometry, weights)
+        radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
+        self._radius = radius / grid.voxel_size
+        self._count = Step(context, "coverage.cl", "coverage", (16, 1, 1))
+        self._normalise = Step(context, "coverage.cl", "normalise", (64, 1, 1))
+        self._last: list[cl.Event] = []
+
+    def _coarse_matrices(self, geometry: ConeBeamGeometry) -> np.ndarray:
+        """Projection matrices from the middles of coarse voxels."""
+        sizes = np.array([_ACROSS, _ACROSS, _ALONG], np.float64)
+        to_fine = np.diag([*sizes, 1.0])
+        to_fine[:3, 3] = (sizes - 1) / 2
+        matrices = geometry.projection_matrices() @ self._grid.index_to_world() @ to_fine
+        return np.asarray(matrices.reshape(-1, 12))
+
+    def compute(
+        self, queue: cl.CommandQueue, wait_for: Sequence[cl.Event] | None = None
+    ) -> cl.Event:
+        """Count the views.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        wait_for : sequence of cl.Event, optional
+            What has to be done before.
+
+        Returns
+        -------
+        cl.Event
+        """
+        nx, ny, nz = self._coarse
+        event = self._count(
+            queue,
+            (nz, nx, ny),
+            self._seen,
+            self._matrices,
+            self._weights,
+            *self._coarse,
+            *self._panel,
+            self._views,
+            wait_for=[*(wait_for or ()), *self._last],
+        )
+        self._last = [event]
+        return event
+
+    def normalise(
+        self,
+        queue: cl.CommandQueue,
+        volume: Array,
+        scale: float,
+        *,
+        first: int = 0,
+        volume_order: str = "zyx",
+        wait_for: Sequence[cl.Event] | None = None,
+    ) -> cl.Event:
+        """Multiply a volume by ``scale / W``, after :meth:`compute`.
+
+        Voxels that hardly any view sees become zero, and so do those outside the circle about the
+        axis that all views see: what lies there was measured in some directions only, and would
+        come back in re-projections as streaks.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        volume : Array
+            float32 (planes, ny, nx), or (ny, nx, planes) with ``volume_order="yxz"``: the grid's
+            volume or a slab of it; changed in place.
+        scale : float
+            Factor.
+        first : int
+            Plane of the grid with which the volume begins.
+        volume_order : {"zyx", "yxz"}
+            Axes of the volume.
+        wait_for : sequence of cl.Event, optional
+            What has to be done before.
+
+        Returns
+        -------
+        cl.Event
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the volume is not of this grid.
+        """
+        planes, ny, nx = self._grid.shape
+        slices = volume_order == "zyx"
+        if getattr(volume, "ndim", 0) == 3:
+            planes = min(planes - first, volume.shape[0 if slices else 2])
+        shape = (planes, ny, nx) if slices else (ny, nx, planes)
+        opencl.check_array("volume", volume, shape, context=self._context)
+        x, y, _ = self._grid.coordinates()
+        size = self._grid.voxel_size
+        event = self._normalise(
+            queue,
+            shape[::-1],
+            volume,
+            self._seen,
+            nx,
+            ny,
+            planes,
+            first,
+            *self._coarse,
+            1.0 / _ACROSS,
+            1.0 / _ALONG,
+            float(-x[0] / size),
+            float(-y[0] / size),
+            self._radius,
+            self._least,
+            float(scale),
+            int(slices),
+            wait_for=[*(wait_for or ()), *self._last],
+        )
+        self._last = [event]
+        return event
+
+
+def _most_views(geometry: ConeBeamGeometry, row_weight: np.ndarray) -> float:
+    """W where it is largest on the axis."""
+    low, high = geometry.source[:, 2].min(), geometry.source[:, 2].max()
+    heights = np.linspace(low, high, _HEIGHTS if high > low else 1)
+    axis = np.column_stack([np.zeros((len(heights), 2)), heights])
+    row = geometry.project(axis)[..., 1]
+    on = (row >= 0) & (row <= geometry.rows - 1)
+    weight = np.interp(row, np.arange(geometry.rows), row_weight)
+    return float(np.sum(np.where(on, weight, 0.0), axis=0).max())

@@ -1,0 +1,101 @@
+// Views that see a voxel, W, on a coarse grid; and a volume divided by it.
+//
+// W(x) = sum over views of the weight of the row that x falls on, linear between rows, 0 for a view
+// on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It varies over many
+// voxels, so that it is computed once for a block of them and interpolated linearly.
+//
+// coverage: one work-item a coarse voxel. normalise: one a voxel. Ranges may be rounded up.
+
+kernel void coverage(
+    global float *restrict seen, // W, (ny, nx, nz) of the coarse grid
+    const ulong seen_offset,
+    global const float *restrict matrices, // (views, 12), from coarse (i, j, k, 1) to (a, b, g)
+    const ulong matrices_offset,
+    global const float *restrict row_weight, // (rows)
+    const ulong row_weight_offset,
+    const int nx, // coarse voxels
+    const int ny,
+    const int nz,
+    const int columns, // pixels; at least 2, as are rows
+    const int rows,
+    const int views)
+{
+    seen += seen_offset;
+    matrices += matrices_offset;
+    row_weight += row_weight_offset;
+    const int k = get_global_id(0), i = get_global_id(1), j = get_global_id(2);
+    if (k >= nz || i >= nx || j >= ny)
+        return;
+    float sum = 0.0f;
+    for (int view = 0; view < views; ++view) {
+        global const float *m = matrices + 12 * view;
+        const float a = m[0] * i + m[1] * j + m[2] * k + m[3];
+        const float b = m[4] * i + m[5] * j + m[6] * k + m[7];
+        const float g = m[8] * i + m[9] * j + m[10] * k + m[11];
+        const float column = a / g, row = b / g;
+        // Written so that a NaN is not on the panel.
+        const int on = g > 0.0f && column >= 0.0f && column <= columns - 1.0f && row >= 0.0f &&
+                       row <= rows - 1.0f;
+        const int r = on ? min((int)row, rows - 2) : 0;
+        const float f = row - r;
+        const float weight = row_weight[r] + f * (row_weight[r + 1] - row_weight[r]);
+        sum += on ? weight : 0.0f;
+    }
+    seen[((size_t)j * nx + i) * nz + k] = sum;
+}
+
+// Where a voxel lies between the middles of coarse ones: index of the lower, and how far on; beyond
+// the outermost middles the fraction goes beyond 0 and 1, which continues W along its slope.
+static inline int between(const int index, const float inverse, const int coarse, float *fraction)
+{
+    const float at = (index + 0.5f) * inverse - 0.5f;
+    const int low = clamp((int)at, 0, max(coarse - 2, 0));
+    *fraction = coarse > 1 ? at - low : 0.0f;
+    return low;
+}
+
+kernel void normalise(
+    global float *restrict volume, // (ny, nx, nz), or (nz, ny, nx) if slices is set
+    const ulong volume_offset,
+    global const float *restrict seen, // W, (coarse_y, coarse_x, coarse_z)
+    const ulong seen_offset,
+    const int nx, // voxels
+    const int ny,
+    const int nz,
+    const int first, // plane of the whole grid that is this volume's first
+    const int coarse_x, // coarse voxels
+    const int coarse_y,
+    const int coarse_z,
+    const float inverse_xy, // 1 / (voxels in a coarse one), along x and y
+    const float inverse_z,
+    const float axis_x, // index along x and y at which the rotation axis lies
+    const float axis_y,
+    const float radius, // of the field of view, voxels
+    const float least, // a voxel with less W is set to 0
+    const float scale,
+    const int slices)
+{
+    volume += volume_offset;
+    seen += seen_offset;
+    const int fast = get_global_id(0), middle = get_global_id(1), slow = get_global_id(2);
+    const int i = slices ? fast : middle, j = slices ? middle : slow, k = slices ? slow : fast;
+    if (i >= nx || j >= ny || k >= nz)
+        return;
+    float fx, fy, fz;
+    const int x = between(i, inverse_xy, coarse_x, &fx);
+    const int y = between(j, inverse_xy, coarse_y, &fy);
+    const int z = between(first + k, inverse_z, coarse_z, &fz);
+    const size_t right = min(x + 1, coarse_x - 1) - x, up = min(z + 1, coarse_z - 1) - z;
+    const size_t back = min(y + 1, coarse_y - 1) - y;
+    global const float *w = seen + ((size_t)y * coarse_x + x) * coarse_z + z;
+    float sum = 0.0f;
+    for (int c = 0; c < 8; ++c) {
+        const int cx = c & 1, cy = c >> 1 & 1, cz = c >> 2;
+        sum += (cx ? fx : 1.0f - fx) * (cy ? fy : 1.0f - fy) * (cz ? fz : 1.0f - fz) *
+               w[(cy * back * coarse_x + cx * right) * coarse_z + cz * up];
+    }
+    const float dx = i - axis_x, dy = j - axis_y;
+    const size_t at = slices ? ((size_t)k * ny + j) * nx + i : ((size_t)j * nx + i) * nz + k;
+    const int good = sum > least && dx * dx + dy * dy <= radius * radius;
+    volume[at] = good ? volume[at] * scale / sum : 0.0f;
+}
