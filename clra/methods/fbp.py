@@ -1,8 +1,10 @@
 """Ramp-filtered back-projection for any trajectory, streamed."""
 
 import math
+from typing import Any
 
 import numpy as np
+import pyopencl as cl
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -74,7 +76,7 @@ def ramp_fbp(
         attenuation = stream.empty((ny, nx, nz))
         attenuation.fill(np.float32(0), queue=queue)
         back = BackProjector(context, geometry, slab, volume_order="yxz")
-        previous = None
+        busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
         for run in runs(seeing[index]):
             for chunk in stream.chunks(run.stop - run.start, radiographs.view_bytes):
                 views = slice(run.start + chunk.start, run.start + chunk.stop)
@@ -85,13 +87,14 @@ def ramp_fbp(
                 event = back(
                     queue, attenuation, filtered, views=views, accumulate=True, wait_for=[ready]
                 )
-                if previous is not None:  # at most two chunks in flight: bounded memory
-                    previous.wait()
-                previous = event
+                # At most two chunks in flight bound the memory, and none may be let go before.
+                busy.append((event, (measured, filtered)))
+                if len(busy) > 2:
+                    busy.pop(0)[0].wait()
                 done += views.stop - views.start
         first = volume.planes[index].start
         coverage.normalise(queue, attenuation, math.pi, first=first, volume_order="yxz")
         volume.put(index, attenuation)
-    queue.finish()
+        queue.finish()
     stream.report(stage, total, total)
     return volume

@@ -43,6 +43,7 @@ def reproject_and_register(
     geometry: ConeBeamGeometry,
     registration: Registration,
     *,
+    magnification: Floats,
     lost: tuple[int, int],
     stage: str = "registering",
 ) -> Registered:
@@ -60,6 +61,8 @@ def reproject_and_register(
         Of the radiographs, with the motion known so far absorbed: what is found comes on top.
     registration : Registration
         Estimator for radiographs of this size.
+    magnification : ndarray, (views,)
+        That `geometry` has absorbed; the registration may expect it to be close to 1.
     lost : (int, int)
         Rows and columns of the full-resolution panel that binning dropped: the magnification is
         about the binned panel's centre, which lies half of that away.
@@ -92,7 +95,8 @@ def reproject_and_register(
             )
             ready = [event]
         estimates = stream.empty((chunk.stop - chunk.start, len(ESTIMATE_FIELDS)))
-        registration(queue, estimates, measured, simulated, wait_for=ready).wait()
+        known = stream.upload(np.log(magnification[chunk]).astype(np.float32))
+        registration(queue, estimates, measured, simulated, known, wait_for=ready).wait()
         table[chunk] = stream.download(estimates)
     stream.report(stage, views, views)
     return _in_full_pixels(table, radiographs.level, lost)

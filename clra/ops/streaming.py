@@ -94,7 +94,10 @@ class Stream:
             self._report(Progress(stage, done, total))
 
     def upload(self, host: Floats) -> cl.array.Array:
-        """Give the device a C-ordered float32 array; a CPU reads it in place."""
+        """Give the device a C-ordered float32 array; a CPU reads it in place.
+
+        The array has to be kept until the device has done with it.
+        """
         flags = cl.mem_flags
         mode = flags.USE_HOST_PTR if self._shared else flags.COPY_HOST_PTR
         buffer = cl.Buffer(self.context, flags.READ_ONLY | mode, hostbuf=host)
@@ -222,13 +225,12 @@ class Radiographs:
         name = f"reading radiographs, binned {self.level} x {self.level}"
         for views in chunks:
             stream.report(name, views.start, self.shape[0])
-            image = stream.upload(self._scan.read(views.start, views.stop))
-            while image.shape[1] // 2 >= self.shape[1]:
-                n, rows, columns = image.shape
-                half = stream.empty((n, rows // 2, columns // 2))
-                restrict(stream.queue, half, image)
-                image = half
-            kept[views] = stream.download(image)
+            images = [stream.upload(self._scan.read(views.start, views.stop))]
+            for _ in range(self.level.bit_length() - 1):
+                n, rows, columns = images[-1].shape
+                images.append(stream.empty((n, rows // 2, columns // 2)))
+                restrict(stream.queue, images[-1], images[-2])
+            kept[views] = stream.download(images[-1])
         stream.report(name, self.shape[0], self.shape[0])
         return kept
 
