@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from clra.model.geometry import ConeBeamGeometry
@@ -83,7 +84,7 @@ def reproject_and_register(
         stream.report(stage, chunk.start, views)
         measured = stream.upload(radiographs.read(chunk))
         simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
-        ready = []
+        ready: list[cl.Event] = []
         for index, projector in enumerate(forward):
             event = projector(
                 queue,
