@@ -40,7 +40,7 @@ class Step:
         self,
         queue: cl.CommandQueue,
         size: Sequence[int],
-        *arguments: Array | int | float,
+        *arguments: Any,
         wait_for: Sequence[cl.Event] | None = None,
     ) -> cl.Event:
         """Run over `size`, rounded up to whole work-groups.

@@ -1,0 +1,250 @@
+"""What the projectors share: their table of views, and the order that they want data in.
+
+Kernels read projections as (view, column, row) and volumes as (y, x, z), see geometry.clh. A
+:class:`Layout` turns the caller's arrays into those and back, in scratch memory of its own.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.ops import opencl
+from clra.ops.steps import to_device
+from clra.ops.transpose import Planes, Transpose
+
+VOLUME_ORDERS = ("zyx", "yxz")
+
+_PAD = 24  # as in geometry.clh
+
+# Projections that one launch treats. They have to stay in the last cache of a CPU, and few launches
+# have to read and write the volume.
+_CPU_BYTES = 16 << 20
+_GPU_BYTES = 256 << 20
+_LEAST_VIEWS = 8
+
+
+class Layout:
+    """Views of a geometry on the device, with scratch for projections and a volume.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where the arrays live.
+    geometry : ConeBeamGeometry
+        Of the projections.
+    grid : VolumeGrid
+        Of the volume.
+    volume_order : {"zyx", "yxz"}
+        Order of the caller's volume.
+    lanes : {1, 8}, optional
+        Form of the kernels, the one for the device by default; the other serves tests.
+    tilted : bool
+        Treat axial views as tilted ones; serves tests.
+
+    Attributes
+    ----------
+    lanes : int
+        As above.
+    columnar : bool
+        Whether the kernels for columns apply, to a CPU and v parallel to z.
+    table : Array
+        (views, 24), see geometry.clh.
+    sizes : tuple of int
+        nx, ny, nz.
+    panel : tuple of int
+        Columns, rows and elements of a padded line.
+    last : list of cl.Event
+        What the next call has to wait for, because it uses the same scratch.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        volume_order: str,
+        lanes: int | None = None,
+        tilted: bool = False,
+    ) -> None:
+        if volume_order not in VOLUME_ORDERS:
+            expected = " or ".join(map(repr, VOLUME_ORDERS))
+            raise ValueError(f"volume_order: found {volume_order!r}, expected {expected}")
+        cpu = opencl.is_cpu(opencl.device_of(context))
+        self.context = context
+        self.grid = grid
+        self.lanes = lanes or (8 if cpu else 1)
+        self.sizes = grid.shape[::-1]
+        self.panel = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
+        self.last: list[cl.Event] = []
+        self._views = geometry.views
+        self._tilted = tilted
+        self.volume_order = volume_order
+        self._volume_shape = (
+            grid.shape if volume_order == "zyx" else (*grid.shape[1:], grid.shape[0])
+        )
+        self._bytes = _CPU_BYTES if cpu else _GPU_BYTES
+        self._transpose = Transpose(context, self.lanes)
+        self._lines: Array | None = None
+        self._volume: Array | None = None
+        self.set_geometry(geometry)
+
+    def set_geometry(self, geometry: ConeBeamGeometry) -> None:
+        """Take other vectors of the same views and panel."""
+        found = (geometry.views, geometry.rows, geometry.columns)
+        expected = (self._views, self.panel[1], self.panel[0])
+        if found != expected:
+            raise ValueError(
+                f"geometry: found {found}, expected {expected} as (views, rows, columns)"
+            )
+        self.table = to_device(self.context, view_table(geometry, self.grid))
+        self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
+
+    def check(
+        self,
+        queue: cl.CommandQueue,
+        names: tuple[str, str],
+        volume: Array,
+        projections: Array,
+        views: slice | None,
+    ) -> tuple[int, int]:
+        """Refuse what does not fit; first of the views, and one past the last."""
+        start, stop, step = (slice(None) if views is None else views).indices(self._views)
+        if step != 1 or stop <= start:
+            raise ValueError(f"views: found {views}, expected successive ones of {self._views}")
+        if queue.context != self.context:
+            raise ValueError("queue: its context is not the operator's")
+        columns, rows, _ = self.panel
+        opencl.check_array(names[0], volume, self._volume_shape, context=self.context)
+        shape = (stop - start, rows, columns)
+        opencl.check_array(names[1], projections, shape, context=self.context)
+        return start, stop
+
+    def batches(self, count: int) -> Iterator[tuple[int, int]]:
+        """Cut `count` views into runs that fit the scratch."""
+        columns, _, pitch = self.panel
+        most = max(_LEAST_VIEWS, self._bytes // (4 * (columns + 1) * pitch))
+        runs = -(-count // most)
+        for run in range(runs):
+            yield count * run // runs, count * (run + 1) // runs
+
+    def gather_projections(
+        self, queue: cl.CommandQueue, projections: Array, wait_for: Sequence[cl.Event]
+    ) -> tuple[Array, cl.Event]:
+        """Projections in the kernels' order, padded, in scratch."""
+        lines = self.scratch_projections(len(projections))
+        columns, rows, pitch = self.panel
+        event = self._transpose(
+            queue,
+            Planes(lines, (columns + 1) * pitch, pitch, columns + 1, pitch),
+            Planes(projections, rows * columns, columns, rows, columns),
+            len(projections),
+            before=_PAD,
+            wait_for=wait_for,
+        )
+        return lines, event
+
+    def scatter_projections(
+        self,
+        queue: cl.CommandQueue,
+        projections: Array,
+        accumulate: bool,
+        wait_for: Sequence[cl.Event],
+    ) -> cl.Event:
+        """From scratch to the caller's projections."""
+        columns, rows, pitch = self.panel
+        lines = self.scratch_projections(len(projections))[:, :, _PAD:]
+        return self._transpose(
+            queue,
+            Planes(projections, rows * columns, columns, rows, columns),
+            Planes(lines, (columns + 1) * pitch, pitch, columns, rows),
+            len(projections),
+            accumulate=accumulate,
+            wait_for=wait_for,
+        )
+
+    def scratch_projections(self, count: int) -> Array:
+        """Lines of `count` views, (count, columns + 1, pitch)."""
+        columns, _, pitch = self.panel
+        if self._lines is None or len(self._lines) < count:
+            self._lines = Array(self.context, (count, columns + 1, pitch), np.float32)
+        return self._lines[:count]
+
+    def gather_volume(
+        self, queue: cl.CommandQueue, volume: Array, wait_for: Sequence[cl.Event]
+    ) -> tuple[Array, Sequence[cl.Event]]:
+        """Volume in the kernels' order."""
+        if self.volume_order == "yxz":
+            return volume, wait_for
+        nx, ny, nz = self.sizes
+        columns = self.scratch_volume(volume)
+        event = self._transpose(
+            queue,
+            Planes(columns, nx * nz, nz, nx, nz),
+            Planes(volume, nx, nx * ny, nz, nx),
+            ny,
+            wait_for=wait_for,
+        )
+        return columns, [event]
+
+    def scatter_volume(
+        self, queue: cl.CommandQueue, volume: Array, accumulate: bool, wait_for: Sequence[cl.Event]
+    ) -> cl.Event:
+        """From scratch to the caller's volume, in the order (z, y, x)."""
+        nx, ny, nz = self.sizes
+        columns = self.scratch_volume(volume)
+        return self._transpose(
+            queue,
+            Planes(volume, nx, nx * ny, nz, nx),
+            Planes(columns, nx * nz, nz, nx, nz),
+            ny,
+            accumulate=accumulate,
+            wait_for=wait_for,
+        )
+
+    def scratch_volume(self, volume: Array) -> Array:
+        """Where kernels write a volume: the caller's own in the order (y, x, z)."""
+        if self.volume_order == "yxz":
+            return volume
+        if self._volume is None:
+            nx, ny, nz = self.sizes
+            self._volume = Array(self.context, (ny, nx, nz), np.float32)
+        return self._volume
+
+
+def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:
+    """What geometry.clh calls a view, (views, 24), composed in float64.
+
+    Raises
+    ------
+    ValueError
+        If a voxel, or the one beyond the last, is not in front of a source.
+    """
+    index_to_world = grid.index_to_world()
+    matrices = geometry.projection_matrices() @ index_to_world
+    ends = [(-1.0, float(n)) for n in grid.shape[::-1]]
+    corners = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(8, 3)
+    depth = (matrices[:, 2, :3] @ corners.T + matrices[:, 2, 3:]).min(axis=1)
+    if not depth.min() > 0:
+        raise ValueError(
+            f"grid: it reaches behind the source of view {int(depth.argmin())}, expected every "
+            "voxel and the one beyond in front of every source"
+        )
+    corner = (
+        geometry.detector
+        - geometry.source
+        - 0.5 * (geometry.columns - 1) * geometry.u
+        - 0.5 * (geometry.rows - 1) * geometry.v
+    )
+    source = (geometry.source - index_to_world[:3, 3]) / grid.voxel_size
+    steps = [vector / grid.voxel_size for vector in (corner, geometry.u, geometry.v)]
+    if geometry.axial:
+        # Exactly, so that the rays of a column share their place in a plane to the last bit.
+        matrices[:, [0, 2], 2] = 0
+        steps[2][:, :2] = 0
+    table = np.concatenate([matrices.reshape(-1, 12), source, *steps], axis=1)
+    return np.ascontiguousarray(table, dtype=np.float32)

@@ -1,0 +1,35 @@
+"""Lined images, whose lines may be read past their ends: see ``kernels/lanes.clh``."""
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+from pyopencl.array import Array
+
+from clra.ops import opencl
+from clra.ops.steps import to_device
+
+# As in lanes.clh.
+MARGIN = 16
+
+
+def lanes(context: cl.Context) -> int:
+    """Columns that a work-item handles at a time."""
+    return 8 if opencl.is_cpu(opencl.device_of(context)) else 2
+
+
+def line_stride(columns: int) -> int:
+    """Elements from one line to the next."""
+    return -(-columns // 16) * 16 + 2 * MARGIN
+
+
+def lined(image: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Lined copy of a host image (rows, columns), for :func:`to_device`."""
+    rows, columns = image.shape
+    out = np.zeros((rows, line_stride(columns)), np.float32)
+    out[:, MARGIN : MARGIN + columns] = image
+    return out
+
+
+def lined_zeros(context: cl.Context, *shape: int) -> Array:
+    """Lined images of zeros, of which the last two of `shape` are rows and columns."""
+    return to_device(context, np.zeros((*shape[:-1], line_stride(shape[-1]))))

@@ -1,0 +1,195 @@
+// Voxel-driven back-projection of filtered projections (FDK type):
+// volume(i, j, k) = sum over views of p(column, row) / g^2, p interpolated bilinearly where the
+// voxel projects into [0, columns - 1] x [0, rows - 1], 0 elsewhere.
+//
+// backproject_voxels treats any geometry. backproject_columns, for CPUs (LANES 8), treats views
+// whose v is parallel to z: the voxels of a column share g and the detector column, and row is
+// linear in z. So two adjacent detector columns are blended once and the blend is resampled.
+//
+// A work-item sums BLOCK voxels along z over the given views. Global sizes are (blocks, nx, ny),
+// rounded up at will. Every voxel has to be in front of every source (g > 0).
+
+#include "geometry.clh"
+
+#ifndef BLOCK
+#define BLOCK (LANES == 1 ? 1 : 32 * LANES) // whole LANES
+#endif
+
+static inline void put(
+    global float *restrict target, const float *sum, const int count, const int accumulate)
+{
+    for (int k = 0; k < count; ++k)
+        target[k] = accumulate ? target[k] + sum[k] : sum[k];
+}
+
+kernel void backproject_voxels(
+    global float *restrict volume, // (ny, nx, nz)
+    const ulong volume_offset,
+    global const float *restrict projections, // (count, columns + 1, pitch), padded
+    const ulong projections_offset,
+    global const float *restrict views, // (count, VIEW_FLOATS)
+    const ulong views_offset,
+    const int nx, // voxels
+    const int ny,
+    const int nz,
+    const int columns, // pixels
+    const int rows,
+    const int pitch, // elements of a padded line
+    const int count, // views
+    const int accumulate) // 1: add to the volume
+{
+    volume += volume_offset;
+    projections += projections_offset + PAD;
+    views += views_offset;
+    const int z = get_global_id(0) * BLOCK;
+    const int x = get_global_id(1);
+    const int y = get_global_id(2);
+    if (z >= nz || x >= nx || y >= ny)
+        return;
+    const int voxels = min(BLOCK, nz - z);
+    const float last_column = columns - 1;
+    const float last_row = rows - 1;
+
+    float sum[BLOCK];
+    for (int k = 0; k < BLOCK; ++k)
+        sum[k] = 0.0f;
+    for (int view = 0; view < count; ++view) {
+        global const float *m = views + view * VIEW_FLOATS;
+        global const float *image = projections + (size_t)view * (columns + 1) * pitch;
+        const float a = fma(m[0], (float)x, fma(m[1], (float)y, m[3]));
+        const float b = fma(m[4], (float)x, fma(m[5], (float)y, m[7]));
+        const float g = fma(m[8], (float)x, fma(m[9], (float)y, m[11]));
+        for (int k = 0; k < voxels; k += LANES) {
+            const real height = (float)(z + k) + RAMP;
+            const real scale = 1.0f / (m[10] * height + g);
+            const real column = (m[2] * height + a) * scale;
+            const real row = (m[6] * height + b) * scale;
+            // Both are monotonic in z: the ends bound what lies between.
+            const float left = SMALLER(FIRST(column), LAST(column));
+            const float right = LARGER(FIRST(column), LAST(column));
+            const float top = SMALLER(FIRST(row), LAST(row));
+            const float bottom = LARGER(FIRST(row), LAST(row));
+            if (right < 0.0f || left > last_column || bottom < 0.0f || top > last_row)
+                continue;
+            const int first = (int)LARGER(left, 0.0f);
+            const int last = (int)SMALLER(right, last_column) + 1;
+            global const float *line = image + (size_t)first * pitch;
+            real value;
+            if (bottom - top <= SPAN - 1.0f && last <= first + 2) {
+                const int base = below(top);
+                const real at = row - (float)base;
+                const whole n = to_whole(at);
+                const real f = at - to_real(n);
+                line += base;
+                value = hat(column - (float)first) * between(load_window(line), n, f);
+                line += pitch;
+                value += hat(column - (first + 1.0f)) * between(load_window(line), n, f);
+                if (last == first + 2) {
+                    // From one pixel before: clang makes permutations only where the subscripts
+                    // are computed, and this keeps it from using those of above.
+                    line += pitch - 1;
+                    const real at = row - (base - 1.0f);
+                    const whole n = to_whole(at);
+                    value += hat(column - (first + 2.0f)) *
+                             between(load_window(line), n, at - to_real(n));
+                }
+            } else {
+                value = 0.0f;
+                for (int c = first; c <= last; ++c, line += pitch)
+                    value += hat(column - (float)c) * taps(line, rows, row);
+            }
+            value *= scale * scale;
+            if (left < 0.0f || right > last_column || top < 0.0f || bottom > last_row)
+                value = WHERE((column >= 0.0f) & (column <= last_column) & (row >= 0.0f) &
+                                  (row <= last_row),
+                              value);
+            store_lanes(load_lanes(sum + k) + value, sum + k);
+        }
+    }
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, voxels, accumulate);
+}
+
+#if LANES == 8
+kernel void backproject_columns(
+    global float *restrict volume, // (ny, nx, nz)
+    const ulong volume_offset,
+    global const float *restrict projections, // (count, columns + 1, pitch), padded
+    const ulong projections_offset,
+    global const float *restrict views, // (count, VIEW_FLOATS)
+    const ulong views_offset,
+    const int nx, // voxels
+    const int ny,
+    const int nz,
+    const int columns, // pixels
+    const int rows,
+    const int pitch, // elements of a padded line
+    const int count, // views
+    const int accumulate) // 1: add to the volume
+{
+    volume += volume_offset;
+    projections += projections_offset + PAD;
+    views += views_offset;
+    const int z = get_global_id(0) * BLOCK;
+    const int x = get_global_id(1);
+    const int y = get_global_id(2);
+    if (z >= nz || x >= nx || y >= ny)
+        return;
+    const int voxels = min(BLOCK, nz - z);
+    const float last_column = columns - 1;
+    const float last_row = rows - 1;
+
+    float sum[BLOCK];
+    for (int k = 0; k < BLOCK; ++k)
+        sum[k] = 0.0f;
+    for (int view = 0; view < count; ++view) {
+        global const float *m = views + view * VIEW_FLOATS;
+        const float g = fma(m[8], (float)x, fma(m[9], (float)y, m[11]));
+        const float scale = 1.0f / g;
+        const float column = fma(m[0], (float)x, fma(m[1], (float)y, m[3])) * scale;
+        if (!(column >= 0.0f && column <= last_column))
+            continue;
+        const float row =
+            fma(m[4], (float)x, fma(m[5], (float)y, fma(m[6], (float)z, m[7]))) * scale;
+        const float slope = m[6] * scale;
+        // the voxels at the panel's first and last row
+        const float per_row = 1.0f / slope;
+        const float one = -row * per_row;
+        const float other = (last_row - row) * per_row;
+        const float first = SMALLER(one, other);
+        const float last = LARGER(one, other);
+        if (last < 0.0f || first >= voxels)
+            continue;
+        const int start = (int)LARGER(first, 0.0f) / LANES * LANES;
+        const int stop = (int)SMALLER(last, voxels - 1.0f) + 1;
+
+        const int c = (int)column;
+        global const float *line = projections + ((size_t)view * (columns + 1) + c) * pitch;
+        global const float *next = line + pitch;
+        const float next_weight = (column - c) * scale * scale;
+        const float line_weight = scale * scale - next_weight;
+        if (fabs(slope) * (LANES - 1) > SPAN) {
+            for (int k = start; k < stop; ++k) {
+                const float r = fma(slope, (float)k, row);
+                if (r >= 0.0f && r <= last_row)
+                    sum[k] += line_weight * tap(line, rows, r) + next_weight * tap(next, rows, r);
+            }
+            continue;
+        }
+        steps step = steps_from(fma(slope, (float)start, row), slope);
+        for (int k = start; k < stop; k += LANES) {
+            const int base = step_base(step);
+            const int8 at = step_lanes(step);
+            const float16 blend = line_weight * load_window(line + base) +
+                                  next_weight * load_window(next + base);
+            float8 value = between(blend, whole_part(at), fraction(at));
+            if (k == start || k + LANES >= stop) { // only here may lanes be off the panel
+                const float8 r = slope * ((float)k + RAMP) + row;
+                value = WHERE((r >= 0.0f) & (r <= last_row), value);
+            }
+            store_lanes(load_lanes(sum + k) + value, sum + k);
+            step.lowest += step.advance;
+        }
+    }
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, voxels, accumulate);
+}
+#endif
