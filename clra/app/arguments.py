@@ -1,0 +1,93 @@
+"""Option values that are more than a number or a name."""
+
+import re
+from pathlib import Path
+
+
+def panel(option: str, text: str) -> tuple[int, int]:
+    """Read "ROWSxCOLUMNS".
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        For example "256x192".
+
+    Raises
+    ------
+    ValueError
+        If it is not that.
+    """
+    found = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
+    if not found:
+        raise ValueError(f"{option}: found {text!r}, expected ROWSxCOLUMNS such as 256x192")
+    return int(found[1]), int(found[2])
+
+
+def interval(option: str, text: str) -> tuple[float, float]:
+    """Read "LOW,HIGH".
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        For example "-10,8".
+
+    Raises
+    ------
+    ValueError
+        If it is not two numbers in order.
+    """
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        low, high = 1.0, 0.0
+    if not low <= high:
+        raise ValueError(f"{option}: found {text!r}, expected LOW,HIGH such as -10,8")
+    return low, high
+
+
+def pixel(text: str) -> float | tuple[float, float]:
+    """Read the size of a pixel: one number, or "ROW,COLUMN" steps [mm].
+
+    Parameters
+    ----------
+    text : str
+        For example "0.139".
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    try:
+        sizes = [float(part) for part in text.split(",")]
+    except ValueError:
+        sizes = []
+    if len(sizes) not in (1, 2):
+        raise ValueError(f"--pixel-size: found {text!r}, expected MM, or MM,MM of row and column")
+    return sizes[0] if len(sizes) == 1 else (sizes[0], sizes[1])
+
+
+def volume_file(path: Path) -> None:
+    """Check that a volume of that name can be written.
+
+    Parameters
+    ----------
+    path : Path
+        By whose suffix the format is chosen.
+
+    Raises
+    ------
+    ValueError
+        If there is no such format.
+    """
+    from clra.io.volumes import HDF5, TIFF
+
+    expected = ", ".join((HDF5[0], *TIFF))
+    if path.suffix.lower() == ".zarr":
+        raise ValueError(f"{path}: zarr volumes cannot be written yet, expected {expected}")
+    if path.suffix.lower() not in HDF5 + TIFF:
+        raise ValueError(f"{path}: found suffix {path.suffix!r}, expected one of {expected}")

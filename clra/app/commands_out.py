@@ -1,0 +1,265 @@
+"""The commands that align, correct, reconstruct and report."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from clra.app.console import Console, Reading, command
+
+ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
+MotionPath = Annotated[
+    Path | None, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
+]
+
+
+def align(
+    console: Console,
+    reading: Reading,
+    scan: ScanPath,
+    out: Annotated[
+        Path, typer.Option("--output", "-o", metavar="MOTION.h5", help="Motion to write.")
+    ],
+    schedule: Annotated[
+        str,
+        typer.Option(
+            metavar="TEXT",
+            help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
+            "auto: QR until converged, then 1HR.",
+        ),
+    ] = "auto",
+    estimate: Annotated[
+        str, typer.Option(metavar="shift|shift+scale", help="What moves in a radiograph.")
+    ] = "shift+scale",
+    report: Annotated[
+        Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
+    ] = None,
+) -> None:
+    """Estimate how each radiograph moved.
+
+    Writes shift and magnification of every view, how much to trust them, and the history of the
+    run. Ctrl-C keeps what the iterations finished so far gave.
+
+    Examples
+    --------
+      clra align scan.nxs -o motion.h5
+      clra align scan.nxs -o motion.h5 --schedule 1QR-1HR --report report.html
+    """
+    from clra.app.errors import InterruptedCommandError
+    from clra.app.findings import Errors, findings_of, summary_of
+    from clra.app.records import Record
+    from clra.io.atomic import ensure_writable
+    from clra.methods.alignment import align as align_scan
+    from clra.methods.results import AlignmentInterrupted
+    from clra.model.schedule import parse_schedule
+
+    parse_schedule(schedule)
+    for path in (out, report):
+        if path is not None:
+            ensure_writable(path)
+    opened = reading.scan(scan)
+    about = {
+        "file": str(scan.absolute()),
+        "estimate": estimate,
+        "command": f"clra align {scan} -o {out} --schedule {schedule} --estimate {estimate}"
+        f"{reading.as_typed()}",
+    }
+    with console.progress() as progress:
+        try:
+            result = align_scan(
+                opened,
+                schedule=schedule,
+                estimate=estimate,
+                device=console.device,
+                progress=progress,
+            )
+        except AlignmentInterrupted as stopped:
+            record = Record.of(stopped.result, opened, interrupted="yes", **about)
+            record.save(out)
+            last = record.history[-1]
+            raise InterruptedCommandError(
+                f"{out} keeps what {len(record.history)} iterations gave, the last at {last.level}"
+            ) from None
+        record = Record.of(result, opened, **about)
+        record.save(out)
+        errors = Errors.of(record, opened)
+        if report is not None:
+            from clra.app.report import write_report
+
+            findings = findings_of(record, opened, device=console.device, progress=progress)
+            write_report(report, findings)
+    values, text = summary_of(record, errors)
+    written = {"file": out, **({"report": report} if report else {})}
+    names = " and ".join(str(path) for path in written.values())
+    console.summary({**written, **values}, f"wrote {names}\n{text}")
+
+
+def reconstruct(
+    console: Console,
+    reading: Reading,
+    scan: ScanPath,
+    out: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="VOLUME", help="Volume to write: .h5 or .tif."),
+    ],
+    method: Annotated[
+        str, typer.Option(metavar="fbp", help="Ramp-filtered back-projection.")
+    ] = "fbp",
+    motion: MotionPath = None,
+    align: Annotated[
+        bool, typer.Option("--align", help="Align the scan first, as clra align would.")
+    ] = False,
+) -> None:
+    """Reconstruct a volume.
+
+    Covers the whole field of view, in 1/mm. The motion goes into the geometry: no radiograph is
+    resampled.
+
+    Examples
+    --------
+      clra reconstruct scan.nxs -o volume.h5 --motion motion.h5
+      clra reconstruct scan.nxs -o volume.tif --align
+    """
+    from clra.app.arguments import volume_file
+    from clra.app.describe import metric
+    from clra.app.outputs import motion_for, room_for
+    from clra.io.volumes import write_volume
+    from clra.methods.reconstruction import METHODS
+    from clra.methods.reconstruction import reconstruct as reconstruct_scan
+    from clra.model.grid import default_grid
+
+    volume_file(out)
+    if motion is not None and align:
+        raise ValueError("--motion, --align: found both, expected one of them")
+    if method not in METHODS:
+        raise ValueError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
+    opened = reading.scan(scan)
+    known = None if motion is None else motion_for(opened, motion)
+    grid = default_grid(opened.geometry)
+    nz, ny, nx = grid.shape
+    room_for(out, 4 * nz * ny * nx)
+    with console.progress() as progress:
+        volume = reconstruct_scan(
+            opened,
+            method=method,
+            grid=grid,
+            motion=known,
+            align=align,
+            device=console.device,
+            progress=progress,
+        )
+        write_volume(out, volume, grid, progress=progress)
+    console.summary(
+        {"file": out, "shape": grid.shape, "voxel_mm": grid.voxel_size, "units": "1/mm"},
+        f"wrote {out}: {nx} x {ny} x {nz} voxels of {metric(grid.voxel_size)}, in 1/mm",
+    )
+
+
+def correct(
+    console: Console,
+    reading: Reading,
+    scan: ScanPath,
+    motion: Annotated[
+        Path, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--output", "-o", metavar="CORRECTED.nxs", help="Scan to write.")
+    ],
+) -> None:
+    """Write a scan of corrected radiographs.
+
+    For programs that cannot take a motion: each radiograph is resampled, once. clra itself
+    reconstructs sharper from the scan as it is, with --motion.
+
+    Examples
+    --------
+      clra correct scan.nxs --motion motion.h5 -o corrected.nxs
+    """
+    from clra.app.outputs import motion_for, room_for
+    from clra.io.scans import write_scan
+    from clra.methods.correction import correct as correct_scan
+
+    opened = reading.scan(scan)
+    known = motion_for(opened, motion)
+    views, rows, columns = opened.shape
+    room_for(out, 4 * views * rows * columns)
+    with console.progress() as progress:
+        write_scan(out, correct_scan(opened, known, console.device), progress=progress)
+    console.summary(
+        {"file": out, "shape": opened.shape},
+        f"wrote {out}: {views} corrected radiographs of {rows} x {columns}",
+    )
+
+
+def report(
+    console: Console,
+    reading: Reading,
+    motion: Annotated[Path, typer.Argument(metavar="MOTION.h5", help="Motion from clra align.")],
+    out: Annotated[
+        Path, typer.Option("--output", "-o", metavar="REPORT.html", help="Page to write.")
+    ],
+    scan: Annotated[
+        Path | None,
+        typer.Option(metavar="SCAN", help="The scan: adds slices and re-projections."),
+    ] = None,
+) -> None:
+    """Write a report of an alignment.
+
+    One HTML page that needs nothing else: corrections, convergence, confidence, and with the scan
+    slices and re-projections before and after.
+
+    Examples
+    --------
+      clra report motion.h5 -o report.html
+      clra report motion.h5 -o report.html --scan scan.nxs
+    """
+    from clra.app.findings import findings_of
+    from clra.app.outputs import check_match
+    from clra.app.records import Record
+    from clra.app.report import write_report
+    from clra.io.atomic import ensure_writable
+
+    record = Record.load(motion)
+    ensure_writable(out)
+    opened = None if scan is None else reading.scan(scan)
+    if opened is not None:
+        check_match(opened, record, motion)
+    with console.progress() as progress:
+        findings = findings_of(record, opened, device=console.device, progress=progress)
+    write_report(out, findings)
+    console.summary({"file": out}, f"wrote {out}")
+
+
+def demo(
+    console: Console,
+    out: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Where to keep the files."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Of all random numbers.", min=0)] = 0,
+) -> None:
+    """Simulate, align and reconstruct a small scan.
+
+    A space-filling scan whose radiographs jitter and drift by up to 10 pixels and grow and shrink
+    by up to 0.2 %. Takes less than a minute on a laptop without a GPU. Without --output the
+    files go to a new folder for temporary files.
+
+    Examples
+    --------
+      clra demo
+      clra demo --output demo --device nvidia
+    """
+    from clra.app.demo import run_demo
+
+    with console.progress() as progress:
+        shown = run_demo(out, seed=seed, device=console.device, progress=progress)
+    console.result(shown.values(), shown.text())
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    command(app, "align")(align)
+    command(app, "reconstruct")(reconstruct)
+    command(app, "correct")(correct)
+    command(app, "report")(report)
+    command(app, "demo")(demo)

@@ -1,0 +1,180 @@
+"""Groups of options that several commands share, and where results go."""
+
+import inspect
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
+
+import numpy as np
+import typer
+
+from clra.app import progress
+
+if TYPE_CHECKING:
+    from clra.model.scan import Scan
+    from clra.ops.streaming import Report
+
+
+@dataclass(frozen=True)
+class Console:
+    """How a command was asked to work and to speak."""
+
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="OpenCL device: part of its name, or its index (see clra devices).",
+        ),
+    ] = None
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False
+    json: Annotated[bool, typer.Option("--json", help="Print the results as one JSON object.")] = (
+        False
+    )
+
+    def progress(self) -> AbstractContextManager["Report"]:
+        """Show progress on stderr while a block runs, unless quiet."""
+        return progress.shown(self.quiet)
+
+    def result(self, values: Mapping[str, Any], text: str) -> None:
+        """Print what a command was run for: JSON, or text for people."""
+        print(to_json(values) if self.json else text)
+
+    def summary(self, values: Mapping[str, Any], text: str) -> None:
+        """Print what a command that wrote a file has to say of it, unless quiet."""
+        if self.json or not self.quiet:
+            self.result(values, text)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How to read a scan that leaves something open."""
+
+    entry: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Which scan, if the file holds several.")
+    ] = None
+    rotation: Annotated[
+        str,
+        typer.Option(
+            metavar="ccw|cw", help="How the sample turns as its angle grows, seen from above."
+        ),
+    ] = "ccw"
+    source_distance: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="Source to rotation axis, in place of the file's."),
+    ] = None
+    parallel: Annotated[
+        bool, typer.Option("--parallel", help="The beam is parallel: put the source far away.")
+    ] = False
+    white: Annotated[
+        float | None,
+        typer.Option(metavar="COUNTS", help="Counts of the open beam, in place of flat frames."),
+    ] = None
+
+    def scan(self, path: Path) -> "Scan":
+        """Open a scan; its radiographs are read when they are needed."""
+        from clra.io.scans import read_scan
+
+        return read_scan(
+            path,
+            entry=self.entry,
+            rotation=self.rotation,
+            source_distance=self.source_distance,
+            parallel=self.parallel,
+            white=self.white,
+        )
+
+    def as_typed(self) -> str:
+        """Return the options that were given, as on the command line."""
+        given = [(f.name, getattr(self, f.name)) for f in fields(self)]
+        changed = [(n, v) for (n, v), f in zip(given, fields(self), strict=True) if v != f.default]
+        words = (f" --{n.replace('_', '-')}" + ("" if v is True else f" {v}") for n, v in changed)
+        return "".join(words)
+
+
+def to_json(values: Mapping[str, Any]) -> str:
+    """Write numpy values, dataclasses and paths as JSON; what is not finite becomes null."""
+    return json.dumps(_plain(values), allow_nan=False, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    return str(value)
+
+
+def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register a function as a command; groups of options among its parameters are spread out.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        Where to.
+    name : str
+        What the command is called.
+
+    Returns
+    -------
+    callable
+        Decorator. A parameter whose type is a dataclass becomes one option for each field of it,
+        the others are typer's. The docstring is the command's help.
+    """
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        own: list[inspect.Parameter] = []
+        shared: list[inspect.Parameter] = []
+        groups: dict[str, type[Any]] = {}
+        for parameter in inspect.signature(function, eval_str=True).parameters.values():
+            if is_dataclass(parameter.annotation):
+                group = cast(type[Any], parameter.annotation)
+                groups[parameter.name] = group
+                shared += _options(group)
+            else:
+                own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+        def run(**values: Any) -> None:
+            for key, group in groups.items():
+                values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
+            function(**values)
+
+        # typer learns a command's options from its signature and its annotations.
+        run.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in [*own, *shared]}
+        app.command(name, help=as_written(inspect.getdoc(function) or ""))(run)
+        return function
+
+    return register
+
+
+def as_written(text: str) -> str:
+    """Keep the lines of the examples in a help text: typer would fill them into a paragraph."""
+    return re.sub(r"Examples:?\n(-+\n)?", "\b\nExamples:\n", text)
+
+
+def _options(group: type[Any]) -> list[inspect.Parameter]:
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(group)
+    ]

@@ -1,0 +1,186 @@
+"""What there is to tell of an alignment: errors against a known truth, pictures, a summary."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.app.describe import Facts, table
+from clra.app.progress import duration
+from clra.app.records import Record
+from clra.model.gauge import gauge_fit, sample_points
+from clra.model.grid import default_grid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+
+if TYPE_CHECKING:
+    from clra.app.comparison import Comparison
+    from clra.ops.streaming import Report
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What an estimate lacks to the truth, view by view.
+
+    Attributes
+    ----------
+    raw, gauge_free : ndarray, (views, 3)
+        Estimate minus truth along u and v [pixel] and in magnification, as it is and without what
+        a movement of the sample as a whole explains.
+    """
+
+    raw: Floats
+    gauge_free: Floats
+
+    @classmethod
+    def of(cls, record: Record, scan: Scan) -> "Errors | None":
+        """Compare an estimate with the truth, if the scan knows it.
+
+        Parameters
+        ----------
+        record : Record
+            Of an alignment of the scan.
+        scan : Scan
+            With its geometry, and its truth if it is a simulation.
+        """
+        if scan.truth is None:
+            return None
+        motion, truth = record.motion, scan.truth
+        difference = Motion(
+            shift_u=motion.shift_u - truth.shift_u,
+            shift_v=motion.shift_v - truth.shift_v,
+            magnification=1 + (motion.magnification - truth.magnification),
+        )
+        points = sample_points(default_grid(scan.geometry))
+        fit = gauge_fit(scan.geometry, difference, points, magnification=record.scale_estimated)
+        return cls(raw=fit.part + fit.remainder, gauge_free=fit.remainder)
+
+    def means(self) -> dict[str, float]:
+        """Mean absolute errors by name."""
+        raw, free = (np.abs(errors).mean(axis=0) for errors in (self.raw, self.gauge_free))
+        return {
+            "mae_u": float(raw[0]),
+            "mae_v": float(raw[1]),
+            "mae_magnification": float(raw[2]),
+            "gauge_free_mae_u": float(free[0]),
+            "gauge_free_mae_v": float(free[1]),
+            "gauge_free_mae_magnification": float(free[2]),
+        }
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a report tells of.
+
+    Attributes
+    ----------
+    record : Record
+        Of the alignment.
+    errors : Errors, optional
+        Where the truth is known.
+    comparison : Comparison, optional
+        Pictures, where the scan was at hand.
+    facts : mapping of str to str
+        Of the scan, for reading.
+    """
+
+    record: Record
+    errors: Errors | None = None
+    comparison: "Comparison | None" = None
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+def findings_of(
+    record: Record,
+    scan: Scan | None,
+    *,
+    device: Any = None,
+    progress: "Report | None" = None,
+) -> Findings:
+    """Collect what a report needs; with the scan, reconstruct it before and after.
+
+    Parameters
+    ----------
+    record : Record
+        Of the alignment.
+    scan : Scan, optional
+        The one that was aligned.
+    device : str or cl.Device, optional
+        Where to reconstruct.
+    progress : callable, optional
+        Told how far it is.
+    """
+    if scan is None:
+        return Findings(record)
+    from clra.app.comparison import compare
+
+    return Findings(
+        record,
+        errors=Errors.of(record, scan),
+        comparison=compare(
+            scan, record.motion, record.confidence, device=device, progress=progress
+        ),
+        facts=Facts.of(scan).lines(),
+    )
+
+
+def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], str]:
+    """Sum an alignment up.
+
+    Parameters
+    ----------
+    record : Record
+        Of the alignment.
+    errors : Errors, optional
+        Where the truth is known.
+
+    Returns
+    -------
+    values : dict
+        For programs.
+    text : str
+        For people.
+    """
+    motion, confidence = record.motion, record.confidence
+    aside = np.abs(np.stack([motion.shift_u, motion.shift_v]))
+    (median_u, median_v), (largest_u, largest_v) = np.median(aside, axis=1), aside.max(axis=1)
+    least, most = motion.magnification.min(), motion.magnification.max()
+    seconds = sum(iteration.seconds for iteration in record.history)
+    values = {
+        "views": motion.views,
+        "median_shift": [median_u, median_v],
+        "largest_shift": [largest_u, largest_v],
+        "magnification": [least, most],
+        "confidence_median": np.median(confidence),
+        "flagged": record.flagged,
+        "gauge": record.gauge,
+        "schedule": record.about.get("schedule", ""),
+        "device": record.about.get("device", ""),
+        "seconds": seconds,
+        "history": record.history,
+        **(errors.means() if errors else {}),
+    }
+    lines = {
+        "run": f"{motion.views} views, {_levels(record)}, {duration(seconds)}",
+        "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
+        f"largest {largest_u:.2f}, {largest_v:.2f}",
+        "magnification": f"{least:.5f} to {most:.5f}",
+        "confidence": f"median {np.median(confidence):.3f}, {len(record.flagged)} views flagged",
+    }
+    if errors:
+        means = errors.means()
+        lines["error"] = (
+            f"mean {means['mae_u']:.3f}, {means['mae_v']:.3f} pixel along u, v against the truth; "
+            f"gauge-free {means['gauge_free_mae_u']:.3f}, {means['gauge_free_mae_v']:.3f}"
+        )
+    return values, table(lines)
+
+
+def _levels(record: Record) -> str:
+    """Count the iterations at each level: "4QR-1HR"."""
+    levels = [iteration.level for iteration in record.history]
+    return "-".join(f"{levels.count(level)}{level}" for level in dict.fromkeys(levels))

@@ -1,0 +1,171 @@
+"""A finished alignment in MOTION.h5, and back."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.io.motions import MotionFile, read_motion_file, write_motion_file
+from clra.io.scans import scan_checksum
+from clra.methods.results import AlignmentResult, Iteration
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known of an alignment, whether it just ended or was read from a file.
+
+    Attributes
+    ----------
+    motion : Motion
+        As estimated.
+    confidence : ndarray, (views,)
+        0 to 1; 0 for a view that is not believed. All 1 where a file does not tell.
+    history : tuple of Iteration
+        Of the run.
+    gauge : mapping of str to float
+        RMS of the motion along each mode [pixel].
+    sigma : (float, float, float) or None
+        Median standard errors of shift_u, shift_v [pixel] and magnification.
+    about : mapping of str to str
+        Where it comes from: "scan", "checksum", "schedule", "estimate", "device", "command",
+        "version", as far as known.
+    """
+
+    motion: Motion
+    confidence: NDArray[np.float64]
+    history: tuple[Iteration, ...] = ()
+    gauge: Mapping[str, float] = field(default_factory=dict)
+    sigma: tuple[float, float, float] | None = None
+    about: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def flagged(self) -> NDArray[np.intp]:
+        """Views that are not believed."""
+        return np.flatnonzero(self.confidence == 0)
+
+    @property
+    def scale_estimated(self) -> bool:
+        """Whether magnifications were estimated."""
+        return bool(np.any(self.motion.magnification != 1))
+
+    @classmethod
+    def of(cls, result: AlignmentResult, scan: Scan, **about: str) -> "Record":
+        """Keep a result.
+
+        Parameters
+        ----------
+        result : AlignmentResult
+            Of the scan.
+        scan : Scan
+            Three of its radiographs are read for a checksum.
+        **about : str
+            What else is to be remembered.
+        """
+        u, v, m = np.median(result.sigma, axis=0).tolist()
+        return cls(
+            motion=result.motion,
+            confidence=result.confidence,
+            history=tuple(result.history),
+            gauge=result.gauge,
+            sigma=(u, v, m),
+            about={
+                "scan": scan.name,
+                "checksum": scan_checksum(scan),
+                "schedule": result.schedule,
+                "device": result.device,
+                **about,
+            },
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write MOTION.h5.
+
+        Parameters
+        ----------
+        path : path-like
+            The file; appears whole or not at all.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written.
+        """
+        own = ("scan", "checksum", "schedule", "device")
+        sigma = dict(zip(_SIGMA, self.sigma, strict=True)) if self.sigma else {}
+        write_motion_file(
+            path,
+            self.motion,
+            confidence=self.confidence,
+            history=self.history,
+            **{key: self.about.get(key, "") for key in own},
+            attributes={
+                "gauge": json.dumps(dict(self.gauge)),
+                **sigma,
+                **{k: v for k, v in self.about.items() if k not in (*own, "version")},
+            },
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Record":
+        """Read MOTION.h5.
+
+        Parameters
+        ----------
+        path : path-like
+            The file; only its shifts must be there.
+
+        Raises
+        ------
+        InputError
+            If it is no motion file.
+        """
+        file = read_motion_file(path)
+        about = {k: v for k, v in file.attributes.items() if k not in ("gauge", *_SIGMA)}
+        unknown = np.ones(file.motion.views)
+        return cls(
+            motion=file.motion,
+            confidence=unknown if file.confidence is None else file.confidence,
+            history=_history(file),
+            gauge=_gauge(file),
+            sigma=_sigma(file),
+            about=about,
+        )
+
+
+_SIGMA = ("sigma_u", "sigma_v", "sigma_magnification")
+
+
+def _history(file: MotionFile) -> tuple[Iteration, ...]:
+    """Rows of the columns; none if another version wrote other columns."""
+    names = [f.name for f in fields(Iteration)]
+    if not set(names) <= set(file.history):
+        return ()
+    columns = [file.history[name].tolist() for name in names]
+    rows = zip(*columns, strict=True)
+    return tuple(Iteration(*map(_known, row)) for row in rows)
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _gauge(file: MotionFile) -> dict[str, float]:
+    try:
+        return {str(k): float(v) for k, v in json.loads(file.attributes["gauge"]).items()}
+    except (KeyError, ValueError, AttributeError):
+        return {}
+
+
+def _sigma(file: MotionFile) -> tuple[float, float, float] | None:
+    try:
+        u, v, m = (float(file.attributes[name]) for name in _SIGMA)
+    except (KeyError, ValueError):
+        return None
+    return u, v, m

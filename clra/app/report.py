@@ -1,0 +1,291 @@
+"""The report of an alignment: one HTML page that needs nothing else."""
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clra.app import figures, page
+from clra.app.findings import Errors, Findings
+from clra.app.progress import duration
+from clra.app.records import Record
+from clra.io.atomic import atomic_path
+from clra.methods.results import Iteration
+from clra.model.motion import Motion
+
+if TYPE_CHECKING:
+    from clra.app.comparison import Comparison, Match
+
+_WITHOUT_SCAN = (
+    "Slices and re-projections need the scan: clra report MOTION.h5 --scan SCAN -o report.html"
+)
+
+
+def write_report(path: str | os.PathLike[str], findings: Findings) -> None:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : path-like
+        HTML file; appears whole or not at all.
+    findings : Findings
+        What to tell.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    text = render(findings)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def render(findings: Findings) -> str:
+    """Build the page as text.
+
+    Parameters
+    ----------
+    findings : Findings
+        What to tell.
+    """
+    record = findings.record
+    body = [
+        page.cards(_cards(findings)),
+        _corrections(record.motion),
+        *([_history(record.history)] if record.history else []),
+        *([_errors(findings.errors)] if findings.errors else []),
+        *_pictures(findings.comparison),
+        _trust(record),
+        _settings(findings),
+    ]
+    subtitle = [f"{record.motion.views} radiographs"]
+    if record.history:
+        subtitle.append(f"aligned in {duration(sum(i.seconds for i in record.history))}")
+    if record.about.get("device"):
+        subtitle.append(f"on {record.about['device']}")
+    name = record.about.get("scan") or "a scan"
+    versions = ", ".join(f"{name} {version}" for name, version in _versions().items())
+    return page.page(f"Alignment of {name}", " ".join(subtitle), body, f"Made by {versions}.")
+
+
+def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:
+    record = findings.record
+    motion, confidence = record.motion, record.confidence
+    aside = np.abs(np.stack([motion.shift_u, motion.shift_v]))
+    median, largest = np.median(aside, axis=1), aside.max(axis=1)
+    scale = motion.magnification
+    flagged = len(record.flagged)
+    cards = [
+        ("Shift, median", f"{median[0]:.2f}, {median[1]:.2f}", "pixel", "|u|, |v|"),
+        ("Shift, largest", f"{largest[0]:.2f}, {largest[1]:.2f}", "pixel", "|u|, |v|"),
+        (
+            "Magnification",
+            f"{1e3 * (scale.min() - 1):+.2f} to {1e3 * (scale.max() - 1):+.2f}",
+            "10\u207b\u00b3",
+            "range about 1",
+        ),
+        (
+            "Confidence, median",
+            f"{np.median(confidence):.3f}",
+            "",
+            f"{flagged} of {motion.views} views flagged",
+        ),
+    ]
+    if findings.errors is not None:
+        means = findings.errors.means()
+        for name, prefix, note in (
+            ("Error, gauge-free", "gauge_free_mae", "mean |u|, |v|; below 0.5 cannot be seen"),
+            ("Error, raw", "mae", "mean |u|, |v|, with the sample's own movement"),
+        ):
+            value = f"{means[f'{prefix}_u']:.3f}, {means[f'{prefix}_v']:.3f}"
+            cards.append((name, value, "pixel", note))
+    elif record.history:
+        last = record.history[-1]
+        value = f"{last.update_u_median:.3f}, {last.update_v_median:.3f}"
+        cards.append(("Last update, median", value, "pixel", "|u|, |v|; converged below 0.1"))
+    return cards
+
+
+def _corrections(motion: Motion) -> str:
+    return page.section(
+        "Correction of each radiograph",
+        page.figure(
+            figures.corrections(motion),
+            "Shift (left) and magnification (right) that bring each measured radiograph back to "
+            "where the ideal geometry puts it: the inverse of the estimated motion. Positive u is "
+            "toward higher columns, positive v toward higher rows; in pixels of the full panel.",
+            "Shift and magnification corrections against view number",
+        ),
+    )
+
+
+def _history(history: Sequence[Iteration]) -> str:
+    known = history[0].mae_u is not None
+    caption = (
+        "Left: how far each iteration still moved the radiographs (median over the views; dotted: "
+        "the farthest moved one); dashed: 0.1 pixel, below which the run counts as converged. "
+    )
+    if known:
+        caption += (
+            "Middle: mean distance to the true motion, raw and without the gauge; dashed: 0.25 "
+            "pixel. "
+        )
+    caption += (
+        "Right: what is left of the radiographs when their registered re-projections are taken "
+        "off; levels of resolution (QR, HR, FR) are not comparable with each other."
+    )
+    head = ["level", "iteration", "update u", "update v", "largest", "residual", "correlation"]
+    head += ["error u", "error v", "gauge-free u", "gauge-free v"] if known else []
+    rows = [
+        [
+            i.level,
+            str(i.iteration),
+            *(f"{x:.3f}" for x in (i.update_u_median, i.update_v_median, i.update_max)),
+            f"{i.residual:.3g}",
+            f"{i.correlation:.4f}",
+            *(
+                "" if x is None else f"{x:.3f}"
+                for x in (i.mae_u, i.mae_v, i.gauge_free_u, i.gauge_free_v)
+                if known
+            ),
+            duration(i.seconds),
+        ]
+        for i in history
+    ]
+    return page.section(
+        "Convergence",
+        page.figure(figures.convergence(history), caption, "Convergence by iteration"),
+        page.table([*head, "time"], rows),
+    )
+
+
+def _errors(errors: Errors) -> str:
+    return page.section(
+        "Error of each view",
+        page.figure(
+            figures.error_of_views(errors.raw[:, :2], errors.gauge_free[:, :2]),
+            "Estimated minus true shift (the scan is a simulation that knows its motion). Raw: as "
+            "it is. Gauge-free: without what a movement of the sample as a whole explains, which "
+            "changes where the volume lies but not how sharp it is. Shaded: half a pixel, below "
+            "which motion leaves no visible trace.",
+            "Error of the shift against view number",
+        ),
+    )
+
+
+def _pictures(comparison: "Comparison | None") -> list[str]:
+    if comparison is None:
+        return [page.section("Before and after", page.paragraph(_WITHOUT_SCAN))]
+    flat, tall, detail = comparison.horizontal, comparison.vertical, comparison.detail
+    limits = figures.grey_limits(flat.after)
+    slices = page.section(
+        "Before and after",
+        page.figure(
+            figures.images(
+                [("Across the axis, before", flat.before, limits), ("After", flat.after, limits)],
+                comparison.voxel_mm,
+            ),
+            f"Middle slice across the rotation axis. Mean squared gradient after alignment: "
+            f"{flat.sharpening:.2f} times that before (noise counts as well as edges).",
+            "Horizontal slices before and after alignment",
+        ),
+        page.figure(
+            figures.images(
+                [("Detail, before", detail.before, limits), ("After", detail.after, limits)],
+                comparison.voxel_mm,
+            ),
+            "The part of that slice with the most structure, enlarged.",
+            "Detail before and after alignment",
+        ),
+        page.figure(
+            figures.images(
+                [("Along the axis, before", tall.before, limits), ("After", tall.after, limits)],
+                comparison.voxel_mm,
+            ),
+            f"Middle slice along the rotation axis. All slices share one grey scale, "
+            f"{limits[0]:.3g} to {limits[1]:.3g} per mm. Mean squared gradient: "
+            f"{tall.sharpening:.2f} times that before.",
+            "Vertical slices before and after alignment",
+        ),
+    )
+    shown = [_match(match, comparison.pixel_mm) for match in comparison.matches]
+    return [slices, page.section("Measured radiographs and their re-projections", *shown)]
+
+
+def _match(match: "Match", pixel_mm: float) -> str:
+    before, after = match.difference.before, match.difference.after
+    reach = max(float(np.percentile(np.abs(before), 99.5)), 1e-6)
+    grey = figures.grey_limits(match.measured)
+    drawn = figures.images(
+        [
+            ("Measured", match.measured, grey),
+            ("Re-projected, after", match.reprojected, grey),
+            ("Difference, before", before, (-reach, reach)),
+            ("Difference, after", after, (-reach, reach)),
+        ],
+        pixel_mm,
+    )
+    rms = [float(np.sqrt(np.mean(image**2))) for image in (before, after)]
+    return page.figure(
+        drawn,
+        f"View {match.view} ({match.why}). Differences are measured minus re-projected, slow "
+        f"background removed, from -{reach:.2g} to {reach:.2g}; RMS {rms[0]:.3g} before, "
+        f"{rms[1]:.3g} after. Scale bars hold at the sample.",
+        f"Radiograph, re-projection and differences of view {match.view}",
+    )
+
+
+def _trust(record: Record) -> str:
+    flagged = record.flagged.tolist()
+    parts = [
+        page.figure(
+            figures.confidence(record.confidence, flagged),
+            "Correlation of each measured radiograph with its re-projection in the band of "
+            "frequencies that is registered. A flagged view fits far worse than the others; it was "
+            "given the motion of its neighbours.",
+            "Confidence against view number",
+        )
+    ]
+    if record.sigma:
+        u, v, m = record.sigma
+        parts.append(
+            page.paragraph(
+                f"Standard error of a view's registration, median: {u:.3f} pixel in u, {v:.3f} "
+                f"pixel in v, {m:.1e} in magnification."
+            )
+        )
+    if flagged:
+        more = f" and {len(flagged) - 40} more" if len(flagged) > 40 else ""
+        parts.append(page.paragraph(f"Flagged views: {', '.join(map(str, flagged[:40]))}{more}."))
+    if record.gauge:
+        parts += [
+            page.paragraph(
+                "Gauge content: root mean square of the part of the motion that each movement of "
+                "the sample as a whole would explain. Radiographs hardly see it, and the volume "
+                "is as sharp with it as without."
+            ),
+            page.bars(record.gauge, "pixel"),
+        ]
+    return page.section("How far to trust it", *parts)
+
+
+def _settings(findings: Findings) -> str:
+    about = dict(findings.record.about)
+    command = about.pop("command", None)
+    about = {key: value for key, value in about.items() if value}
+    facts = {name: value.replace(" um", " \u00b5m") for name, value in findings.facts.items()}
+    tables = [page.facts(values) for values in (facts, about) if values]
+    parts = [page.columns(tables)]
+    if command:
+        parts += [page.paragraph("To do it again:"), page.code(command)]
+    return page.section("Scan, settings and how to do it again", *parts)
+
+
+def _versions() -> dict[str, str]:
+    names: Sequence[str] = ("clra", "numpy", "pyopencl")
+    found: dict[str, Any] = {name: importlib.metadata.version(name) for name in names}
+    return {**found, "Python": platform.python_version()}

@@ -1,0 +1,33 @@
+from pathlib import Path
+
+import pytest
+
+from clra.app.arguments import interval, panel, pixel, volume_file
+
+
+def test_values_are_read():
+    assert panel("--panel", "256x192") == (256, 192)
+    assert interval("--shift", "-10,8") == (-10.0, 8.0)
+    assert pixel("0.139") == 0.139
+    assert pixel("0.139,0.14") == (0.139, 0.14)
+    volume_file(Path("a/volume.H5"))
+
+
+@pytest.mark.parametrize(
+    ("read", "text"),
+    [
+        (lambda t: panel("--panel", t), "256"),
+        (lambda t: panel("--panel", t), "0x4"),
+        (lambda t: interval("--shift", t), "8,-10"),
+        (lambda t: interval("--shift", t), "1,2,3"),
+        (lambda t: interval("--shift", t), "nan,1"),
+        (pixel, "1,2,3"),
+        (pixel, "thick"),
+        (lambda t: volume_file(Path(t)), "volume.zarr"),
+        (lambda t: volume_file(Path(t)), "volume"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_the_text_found(read, text):
+    with pytest.raises(ValueError, match="expected") as caught:
+        read(text)
+    assert text in str(caught.value)

@@ -1,0 +1,245 @@
+"""Commands in this process: what they print, refuse and write."""
+
+import json
+import re
+from functools import partial
+
+import h5py
+import numpy as np
+import pytest
+
+from clra.app import demo
+from clra.io.motions import write_motion_file
+from clra.io.scans import read_scan
+from clra.io.volumes import read_volume
+from clra.methods.results import AlignmentInterrupted
+from clra.model.grid import default_grid
+from clra.model.motion import Motion
+
+COMMANDS = (
+    "devices", "info", "import", "simulate", "align", "reconstruct", "correct", "report", "demo",
+)  # fmt: skip
+
+
+def refused(done, status, *parts):
+    code, out, err = done
+    assert code == status, err
+    assert out == ""
+    assert err.startswith("interrupted: " if status == 130 else "error: ")
+    assert err.count("\n") == 1 and err.endswith("\n")
+    for part in parts:
+        assert str(part) in err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_examples_and_the_common_options(clra, command):
+    code, out, _ = clra(command, "--help")
+    assert code == 0
+    assert re.search(rf"^  Examples:\n    clra {command}", out, re.MULTILINE)
+    for option in ("--device", "--quiet", "--json"):
+        assert option in out
+
+
+def test_help_lists_the_commands(clra):
+    code, out, _ = clra("--help")
+    assert code == 0
+    assert re.findall(r"^  ([a-z]+)  ", out.partition("Commands:")[2], re.MULTILINE) == list(
+        COMMANDS
+    )
+    assert clra()[1] == out
+    code, out, _ = clra("--version")
+    assert code == 0 and re.fullmatch(r"clra \d+\.\d+\.\d+\n", out)
+
+
+def test_devices(clra):
+    code, out, _ = clra("devices", "--json")
+    told = json.loads(out)
+    assert code == 0 and told["taken"] in [device["index"] for device in told["devices"]]
+    code, out, _ = clra("devices")
+    assert code == 0 and out.startswith("* ") and len(out.splitlines()) == len(told["devices"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["devices", "--nonsense"], "--nonsense"),
+        (["nonsense"], "nonsense"),
+        (["align", "scan.nxs"], "--output"),
+        (["reconstruct"], "SCAN"),
+        (["simulate", "s.nxs", "--views", "many"], "many"),
+    ],
+)
+def test_wrong_usage_is_one_line(clra, arguments, part):
+    refused(clra(*arguments), 2, part, "--help)")
+
+
+def test_a_device_that_is_not_there_fails_with_what_there_is(clra):
+    refused(clra("devices", "--device", "abacus"), 1, "'abacus'", "found")
+
+
+@pytest.mark.filterwarnings("default")
+def test_without_any_device_there_is_advice_and_info_still_describes(
+    clra, monkeypatch, scan_file, tmp_path
+):
+    monkeypatch.setattr("clra.ops.opencl._all_devices", list)
+    refused(clra("devices"), 1, "PoCL")
+    refused(clra("align", scan_file, "-o", tmp_path / "m.h5"), 1, "PoCL")
+    code, out, err = clra("info", scan_file)
+    assert code == 0 and "space-filling" in out
+    assert err.startswith("warning: no times") and "PoCL" in err
+    told = json.loads(clra("info", scan_file, "--json")[1])
+    assert told["levels"][0]["iteration_s"] is None
+
+
+def test_bad_input_is_refused_before_work(clra, scan_file, motion_file, tmp_path):
+    volume = tmp_path / "v.h5"
+    refused(clra("info", tmp_path / "none.nxs"), 2, "none.nxs")
+    refused(clra("info", motion_file), 2, motion_file)
+    for suffix in ("zarr", "mha"):
+        refused(clra("reconstruct", scan_file, "-o", tmp_path / f"v.{suffix}"), 2, suffix, ".h5")
+    refused(
+        clra("reconstruct", scan_file, "-o", volume, "--motion", motion_file, "--align"),
+        2,
+        "--motion",
+        "--align",
+    )
+    refused(clra("reconstruct", scan_file, "-o", volume, "--method", "magic"), 2, "magic", "fbp")
+    refused(clra("reconstruct", scan_file, "-o", tmp_path / "no" / "v.h5"), 1, "make the folder")
+    refused(clra("align", scan_file, "-o", volume, "--schedule", "2XR"), 2, "2XR")
+    refused(clra("align", scan_file, "-o", volume, "--estimate", "all"), 2, "all")
+    refused(clra("align", scan_file, "-o", tmp_path / "no" / "m.h5"), 1, "make the folder")
+    refused(clra("report", scan_file, "-o", tmp_path / "r.html"), 2, scan_file)
+    write_motion_file(tmp_path / "short.h5", Motion.identity(7))
+    for arguments in (
+        ["reconstruct", scan_file, "-o", volume, "--motion", tmp_path / "short.h5"],
+        ["correct", scan_file, "-o", tmp_path / "c.nxs", "--motion", tmp_path / "short.h5"],
+        ["report", tmp_path / "short.h5", "-o", tmp_path / "r.html", "--scan", scan_file],
+    ):
+        refused(clra(*arguments), 2, "short.h5", "7 views", "24")
+    left = sorted(file.name for file in tmp_path.iterdir())
+    assert left == ["motion.h5", "short.h5"]
+
+
+def test_simulate_writes_a_scan_that_knows_its_motion(clra, tmp_path):
+    out = tmp_path / "s.nxs"
+    options = ["--trajectory", "helix", "--motion", "smooth", "--shift", "-3,2", "--views", 13]
+    code, text, _ = clra("simulate", out, *options, "--panel", "21x17", "--noise", 500, "--json")
+    told = json.loads(text)
+    assert code == 0 and told["views"] == 13 and told["largest_shift"] < 5
+    scan = read_scan(out)
+    assert scan.shape == (13, 21, 17)
+    assert scan.truth is not None
+    assert np.abs(scan.truth.shift_u).max() == pytest.approx(told["largest_shift"], abs=2)
+    code, text, err = clra("simulate", out, "--views", 4, "--panel", "9x9", "--quiet")
+    assert (code, text, err) == (0, "", "")
+    refused(clra("simulate", out, "--panel", "9"), 2, "--panel", "'9'")
+    refused(clra("simulate", out, "--trajectory", "spiral"), 2, "spiral", "helix")
+    assert read_scan(out).views == 4  # what stood there before stands there still
+
+
+def test_import_makes_a_scan_of_frames(clra, tmp_path):
+    random = np.random.default_rng(0)
+    frames = random.integers(200, 900, (5, 6, 7)).astype("<u2")
+    frames.tofile(tmp_path / "frames.raw")
+    np.full((1, 6, 7), 1000, "<u2").tofile(tmp_path / "flat.raw")
+    (tmp_path / "angles.txt").write_text("0\n72\n144\n216\n288\n", encoding="ascii")
+    options = [
+        "--angles", tmp_path / "angles.txt", "--source-distance", 10, "--detector-distance", 90,
+        "--pixel-size", 0.1, "--shape", "6x7", "--flat", tmp_path / "flat.raw",
+    ]  # fmt: skip
+    out = tmp_path / "scan.nxs"
+    code, text, _ = clra("import", tmp_path / "frames.raw", *options, "-o", out)
+    assert code == 0 and text == f"wrote {out}\n"
+    scan = read_scan(out)
+    np.testing.assert_allclose(scan.read(0, 5), -np.log(frames / 1000.0), rtol=1e-5, atol=1e-6)
+    assert scan.geometry.source_to_detector == pytest.approx(100)
+    (tmp_path / "angles.txt").write_text("0\n72\n", encoding="ascii")
+    refused(clra("import", tmp_path / "frames.raw", *options, "-o", out), 2, "angles.txt", "2", "5")
+
+
+def test_info_tells_size_and_cost(clra, scan_file):
+    code, out, _ = clra("info", scan_file)
+    assert code == 0
+    for part in ("space-filling", "41 rows x 33 columns", "FR", "QR", "iteration"):
+        assert part in out
+    code, out, _ = clra("info", scan_file, "--json")
+    told = json.loads(out)
+    assert told["scan"]["views"] == 24 and told["levels"][0]["level"] == "FR"
+    assert told["scan"]["path"]["kind"] == "space-filling"
+
+
+def test_align_reconstruct_correct_report(clra, scan_file, tmp_path):
+    motion, page = tmp_path / "m.h5", tmp_path / "r.html"
+    code, out, err = clra(
+        "align", scan_file, "-o", motion, "--schedule", "1HR", "--report", page, "--json"
+    )
+    assert code == 0, err
+    told = json.loads(out)
+    assert told["views"] == 24 and len(told["history"]) == 1 and told["mae_u"] > 0
+    with h5py.File(motion) as file:
+        assert file["motion/shift_u"].shape == (24,)
+        assert file.attrs["estimate"] == "shift+scale"
+    assert "Before and after" in page.read_text(encoding="utf-8")
+    for name in ("v.h5", "v.tif"):
+        code, out, err = clra("reconstruct", scan_file, "-o", tmp_path / name, "--motion", motion)
+        assert code == 0 and str(tmp_path / name) in out, err
+    volume, grid = read_volume(tmp_path / "v.h5")
+    expected = default_grid(read_scan(scan_file).geometry)
+    assert volume.shape == expected.shape and grid.voxel_size == pytest.approx(expected.voxel_size)
+    assert volume.std() > 0
+    code, out, err = clra(
+        "correct", scan_file, "--motion", motion, "-o", tmp_path / "c.nxs", "--quiet"
+    )
+    assert (code, out, err) == (0, "", "")
+    assert read_scan(tmp_path / "c.nxs").shape == (24, 41, 33)
+    code, out, err = clra("report", motion, "-o", tmp_path / "short.html")
+    assert code == 0 and "--scan SCAN" in (tmp_path / "short.html").read_text(encoding="utf-8")
+
+
+def test_ctrl_c_keeps_the_finished_iterations(clra, monkeypatch, result, scan_file, tmp_path):
+    def interrupted(*_, **__):
+        raise AlignmentInterrupted(result)
+
+    monkeypatch.setattr("clra.methods.alignment.align", interrupted)
+    motion = tmp_path / "m.h5"
+    refused(clra("align", scan_file, "-o", motion), 130, "m.h5", "2 iterations", "HR")
+    with h5py.File(motion) as file:
+        np.testing.assert_array_equal(file["motion/shift_u"], result.motion.shift_u)
+        assert file.attrs["interrupted"] == "yes"
+
+
+def test_ctrl_c_before_that_leaves_nothing(clra, monkeypatch, scan_file, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clra.methods.alignment.align", interrupted)
+    refused(clra("align", scan_file, "-o", tmp_path / "m.h5"), 130, "nothing was written")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_noticed_before_work(clra, monkeypatch, scan_file, tmp_path):
+    import shutil
+
+    full = shutil._ntuple_diskusage(100, 99, 1)
+    monkeypatch.setattr("clra.app.outputs.shutil.disk_usage", lambda path: full)
+    refused(clra("reconstruct", scan_file, "-o", tmp_path / "v.h5"), 1, "v.h5", "free some space")
+
+
+@pytest.mark.filterwarnings("default")
+def test_the_motion_of_another_scan_is_warned_of(clra, record, scan_file, tmp_path):
+    path = tmp_path / "m.h5"
+    write_motion_file(path, record.motion, checksum="sha256:other")
+    code, _, err = clra("correct", scan_file, "--motion", path, "-o", tmp_path / "c.nxs", "-q")
+    assert code == 0
+    assert err.startswith("warning: ") and "other radiographs" in err and err.count("\n") == 1
+
+
+def test_demo_shows_that_it_works(clra, monkeypatch, tmp_path):
+    small = partial(demo.run_demo, views=120, panel=(96, 72))
+    monkeypatch.setattr("clra.app.demo.run_demo", small)
+    code, out, err = clra("demo", "--output", tmp_path / "d", "--json")
+    assert code == 0, err
+    told = json.loads(out)
+    assert told["gauge_free_mae_u"] < 0.5 and told["gauge_free_mae_v"] < 1
+    names = {file.name for file in (tmp_path / "d").iterdir()}
+    assert names == {"scan.nxs", "motion.h5", "before.h5", "after.h5", "report.html"}

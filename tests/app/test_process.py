@@ -1,0 +1,61 @@
+"""Commands in a process of their own, without a terminal."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+CLRA = (sys.executable, "-m", "clra.app.cli")
+
+
+def run(*arguments, **options):
+    done = subprocess.run(
+        [*CLRA, *map(str, arguments)], capture_output=True, text=True, timeout=120, **options
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_devices_are_listed_quickly_and_nothing_heavy_is_imported():
+    code = (
+        "import sys; from clra.app.cli import app; import clra.ops.opencl; "
+        "heavy = {'matplotlib', 'scipy', 'h5py', 'rich', 'nxtomo', 'reikna'} & set(sys.modules); "
+        "sys.exit(', '.join(sorted(heavy)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    started = time.perf_counter()
+    code, out, err = run("devices")
+    assert (code, err) == (0, "") and out
+    assert time.perf_counter() - started < 5  # 0.4 s on a quiet machine
+
+
+def test_debug_adds_a_traceback_on_either_side_of_the_command():
+    for arguments in (["--debug", "info", "none.nxs"], ["info", "none.nxs", "--debug"]):
+        code, out, err = run(*arguments)
+        assert code == 2 and out == ""
+        assert "Traceback" in err and err.splitlines()[-1].startswith("error: none.nxs")
+    code, _, err = run("info", "none.nxs")
+    assert code == 2 and err.count("\n") == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise there")
+def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
+    process = subprocess.Popen(
+        [*CLRA, "simulate", str(tmp_path / "s.nxs"), "--views", "3456", "--panel", "928x512"],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    for _ in range(600):
+        if any(tmp_path.iterdir()):
+            break
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out == "" and err.splitlines()[-1].startswith("interrupted: ")
+    assert list(tmp_path.iterdir()) == []

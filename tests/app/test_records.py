@@ -1,0 +1,37 @@
+import h5py
+import numpy as np
+
+from clra.app.records import Record
+from clra.io.motions import write_motion_file
+from clra.io.scans import scan_checksum
+
+
+def test_a_record_survives_its_file(record, scan, motion_file):
+    loaded = Record.load(motion_file)
+    assert loaded.motion == record.motion
+    np.testing.assert_array_equal(loaded.confidence, record.confidence)
+    assert loaded.history == record.history
+    assert loaded.gauge == record.gauge and loaded.sigma == record.sigma
+    assert {**record.about, "version": loaded.about["version"]} == loaded.about
+    assert loaded.about["checksum"] == scan_checksum(scan)
+
+
+def test_flagged_views_are_those_without_confidence(record):
+    assert record.flagged.tolist() == [3, 17]
+    assert record.scale_estimated
+
+
+def test_the_file_is_the_one_that_others_read(motion_file, record):
+    with h5py.File(motion_file) as file:
+        np.testing.assert_array_equal(file["motion/shift_u"], record.motion.shift_u)
+        assert file["motion/shift_u"].attrs["units"] == "pixel"
+        assert list(file["history/level"].asstr()) == ["QR", "HR"]
+        assert file.attrs["schedule"] == "1QR-1HR"
+
+
+def test_a_file_of_shifts_alone_is_enough(record, tmp_path):
+    write_motion_file(tmp_path / "bare.h5", record.motion)
+    bare = Record.load(tmp_path / "bare.h5")
+    assert bare.motion == record.motion
+    assert bare.history == () and bare.gauge == {} and bare.sigma is None
+    assert not len(bare.flagged)
