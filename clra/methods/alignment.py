@@ -18,11 +18,11 @@ from clra.methods.fbp import ramp_fbp
 from clra.methods.outliers import from_neighbours, outliers
 from clra.methods.reprojection import Registered, reproject_and_register
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
-from clra.model.gauge import gauge_fit, motion_error, sample_points
+from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.model.schedule import Stage, converged, level_name, parse_schedule
+from clra.model.schedule import Stage, converged, level_name, parse_schedule, update_size
 from clra.ops.registration import Registration
 from clra.ops.streaming import Radiographs, Report, Stream
 
@@ -30,13 +30,14 @@ Floats = NDArray[np.float64]
 
 METHODS = ("ra",)
 ESTIMATES = ("shift", "shift+scale")
+GAUGES = ("anchored", "free")
 
-# Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look past
-# it, and what they see there has to be in the re-projection too.
+# Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
+# past it, and what they see there has to be in the re-projection too.
 _MARGIN = 0.15
-# Expected standard deviation of log(magnification): the paper's scans stay within 1 +- 0.001. Panels
-# of 500 columns at quarter resolution tell better themselves; on small ones a slow drift of the
-# magnification along the scan is hardly seen and would run away to 1 per cent without this.
+# Expected standard deviation of log(magnification): the paper's scans stay within 1 +- 0.001.
+# Panels of 500 columns tell better themselves even at quarter resolution; on small ones a slow
+# drift of the magnification along the scan is hardly seen, and would run away to 1 per cent.
 _SPREAD = 1e-3
 # Sigma of the band-pass in pixels of the level, first iteration and later: the first
 # reconstruction is blurred by the motion itself, and its fine detail is not the sample's.
@@ -55,6 +56,7 @@ def align(
     truth: Motion | None = None,
     progress: Report | None = None,
     memory: int = 3,
+    gauge: str = "anchored",
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> AlignmentResult:
@@ -84,6 +86,11 @@ def align(
     memory : int
         Iterations that Anderson acceleration looks back on within a level; 0 for the paper's plain
         iteration.
+    gauge : {"anchored", "free"}
+        What becomes of the part of the motion that a movement of the sample as a whole (three
+        translations, two tilts, a stretch along z) would explain as well. The data hardly see it,
+        and what the iteration finds of it comes from how a cone beam reconstructs the ends of a
+        scan: it would go on and stretch the sample. "anchored" takes it out in each iteration.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 
@@ -103,7 +110,7 @@ def align(
     .. [1] "Multi-resolution radiograph alignment for motion correction in X-ray micro-tomography",
        Algorithms 1 and 2.
     """
-    _check(scan, method, estimate)
+    _check(scan, method, estimate, gauge)
     stages = parse_schedule(schedule)
     stream = Stream(
         device,
@@ -113,7 +120,8 @@ def align(
     )
     grid = grid or default_grid(scan.geometry)
     grid = grid.padded(round(_MARGIN * grid.shape[0]))
-    run = _Run(stream, scan, grid, schedule, estimate == "shift+scale", memory)
+    scale, anchor = estimate == "shift+scale", gauge == "anchored"
+    run = _Run(stream, scan, grid, schedule, scale, memory, anchor)
     run.motion = motion or Motion.identity(scan.views)
     run.truth = truth or scan.truth
     try:
@@ -126,11 +134,13 @@ def align(
     return run.result()
 
 
-def _check(scan: Scan, method: str, estimate: str) -> None:
+def _check(scan: Scan, method: str, estimate: str, gauge: str) -> None:
     if method not in METHODS:
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
     if estimate not in ESTIMATES:
         raise ValueError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
+    if gauge not in GAUGES:
+        raise ValueError(f"gauge: found {gauge!r}, expected one of {GAUGES}")
     if scan.views < 2:
         raise ValueError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")
 
@@ -145,14 +155,20 @@ class _Run:
     schedule: str
     scale: bool
     memory: int
+    anchor: bool
     motion: Motion = field(init=False)
     truth: Motion | None = field(init=False, default=None)
     history: list[Iteration] = field(init=False, default_factory=list)
     registered: Registered = field(init=False)
+    found: Motion = field(init=False)  # by the last iteration, with its gauge
     weak: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.points = sample_points(self.grid)
+        points = sample_points(self.grid)
+        self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
+        # Taken out of the shifts alone: to fit them a little better, the joint fit would take
+        # magnifications of several per cent.
+        self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
 
     def align_level(self, stage: Stage) -> None:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level)."""
@@ -165,8 +181,7 @@ class _Run:
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(radiographs, first=not self.history, title=of)
-            self._move(found, anderson)
-            update_u, update_v = np.abs(found.motion.shift_u), np.abs(found.motion.shift_v)
+            update_u, update_v = np.abs(self._move(found, anderson))
             self.history.append(
                 Iteration(
                     level=name,
@@ -183,7 +198,7 @@ class _Run:
             # 6, 13: until converged
             if stage.iterations is None and converged(update_u, update_v, previous):
                 break
-            previous = float(np.median(np.concatenate([update_u, update_v])))
+            previous = update_size(update_u, update_v)[0]
 
     def _iterate(self, radiographs: Radiographs, *, first: bool, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""
@@ -222,12 +237,15 @@ class _Run:
             stage=f"{title}: registering",
         )
 
-    def _move(self, found: Registered, anderson: Anderson) -> None:
-        """Algorithm 1, step 5: append what was found to the motion known so far."""
+    def _move(self, found: Registered, anderson: Anderson) -> Floats:
+        """Algorithm 1, step 5: append what was found; returns the plain step in u and v."""
         self.registered = found
         self.weak = outliers(found.correlation)
+        self.found = from_neighbours(self.motion.then(found.motion), self.weak)
         here = self._as_lengths(self.motion)
-        there = self._as_lengths(from_neighbours(self.motion.then(found.motion), self.weak))
+        there = self._as_lengths(
+            self.shift_gauge.anchored(self.found) if self.anchor else self.found
+        )
         moved = anderson.next(here, there - here)
         half = self._lever
         self.motion = Motion(
@@ -235,6 +253,7 @@ class _Run:
             shift_v=moved[1],
             magnification=np.exp(moved[2] / half) if self.scale else None,
         ).normalised()
+        return np.asarray((there - here)[:2])
 
     @property
     def _lever(self) -> float:
@@ -251,9 +270,7 @@ class _Run:
     def _errors(self) -> dict[str, float]:
         if self.truth is None:
             return {}
-        error = motion_error(
-            self.motion, self.truth, self.scan.geometry, self.points, magnification=self.scale
-        )
+        error = self.gauge.error(self.motion, self.truth)
         return {
             name: getattr(error, name)
             for name in (
@@ -268,13 +285,12 @@ class _Run:
 
     def result(self) -> AlignmentResult:
         """Return what the iterations so far gave."""
-        gauge = gauge_fit(self.scan.geometry, self.motion, self.points, magnification=self.scale)
         return AlignmentResult(
             motion=self.motion,
             history=self.history,
             confidence=np.clip(np.where(self.weak, 0.0, self.registered.correlation), 0.0, 1.0),
             sigma=self.registered.sigma,
-            gauge=dict(gauge.rms_by_mode),
+            gauge=dict(self.gauge.fit(self.found).rms_by_mode),
             flagged=tuple(int(view) for view in np.flatnonzero(self.weak)),
             schedule=self.schedule,
             device=self.stream.device.name.strip(),

@@ -21,7 +21,8 @@ class Iteration:
     iteration : int
         From 1 at each level.
     update_u_median, update_v_median, update_max : float
-        Medians of |shift found| in u and v, and the largest in either.
+        Medians of |change of the shift| in u and v that the registration asks for, and the largest
+        in either.
     correlation, residual : float
         Medians over the views, after registration.
     seconds : float
@@ -62,8 +63,9 @@ class AlignmentResult:
     sigma : ndarray, (views, 3)
         Standard errors of shift_u, shift_v [pixel] and magnification, from that registration.
     gauge : dict of str to float
-        RMS [pixel] of the part of `motion` that each movement of the sample as a whole explains:
-        data see that part badly, and the volume is as sharp with it as without.
+        RMS [pixel] of the part of the last estimate that each movement of the sample as a whole
+        explains. The data hardly see that part; the volume is as sharp with it as without. With
+        ``gauge="anchored"`` it is not in `motion` any more.
     flagged : tuple of int
         Views whose registration is not believed; they have their neighbours' motion.
     schedule, device : str

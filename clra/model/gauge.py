@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.model.checks import whole
-from clra.model.gauge_modes import GAUGE_MODES, gauge_columns
+from clra.model.gauge_modes import GAUGE_MODES, gauge_columns, mode_field
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
@@ -25,6 +25,11 @@ Floats = NDArray[np.float64]
 # of any one cloud's gauge stays, at half and twice this too. Far below, differences between clouds
 # are taken for modes and bend the motion by 3 pixels.
 _COMMON = 0.05
+
+# Part of a movement's displacement that shifts have to imitate for it to count as gauge. Helices: a
+# translation 0.7 to 1, a tilt or stretch of a sample many panels high 0.5 to 0.9. A circle, whose
+# views see all of the sample: a tilt or stretch below 0.1, and there the data see it well.
+_IMITATED = 0.25
 
 
 def sample_points(grid: VolumeGrid, count: int = 1500, seed: int = 0) -> Floats:
@@ -74,47 +79,115 @@ class GaugeFit:
     rms_by_mode: dict[str, float]
 
 
-def gauge_fit(
-    geometry: ConeBeamGeometry, motion: Motion, points: ArrayLike, *, magnification: bool = True
-) -> GaugeFit:
-    """Fit the gauge modes to a motion, or to the difference of two.
+class Gauge:
+    """The gauge modes of one scan, computed once.
 
     Parameters
     ----------
     geometry : ConeBeamGeometry
         Of the scan, at full resolution.
-    motion : Motion
-        Of the same views.
     points : array_like, (n, 3)
         Points of the sample, as of `sample_points` [mm].
     magnification : bool
-        Whether magnification was estimated. If so, it is part of the fit, weighted as the
+        Whether magnification is estimated. If so, it is part of the fit, weighted as the
         displacement in pixels at half the panel's half diagonal, and scale is a mode; if not,
         both are left out.
-
-    Returns
-    -------
-    GaugeFit
-        Least squares on the columns of `gauge_columns`.
     """
-    if motion.views != geometry.views:
-        raise ValueError(f"motion: found {motion.views} views, expected {geometry.views}")
-    modes = _modes(magnification)
-    weight = _weight(geometry, magnification)
-    design = _rows(gauge_columns(geometry, points, modes).reshape(3, motion.views, -1), weight)
-    table = _table(motion)
-    target = _rows(table.T, weight)
-    coefficients = _least_squares(design, target, 1e-9)
-    part = np.zeros_like(table)
-    part[:, weight > 0] = (design @ coefficients).reshape(-1, motion.views).T / weight[weight > 0]
-    size = np.linalg.norm(design, axis=0)
-    alone = np.abs(design.T @ target) / np.where(size > 0, size, 1.0) / np.sqrt(motion.views)
-    return GaugeFit(
-        coefficients=dict(zip(modes, coefficients.tolist(), strict=True)),
-        part=part,
-        remainder=table - part,
-        rms_by_mode=dict(zip(modes, alone.tolist(), strict=True)),
-    )
+
+    def __init__(
+        self, geometry: ConeBeamGeometry, points: ArrayLike, *, magnification: bool = True
+    ) -> None:
+        self.views = geometry.views
+        self.modes = _modes(magnification)
+        self._weight = _weight(geometry, magnification)
+        columns = gauge_columns(geometry, points, self.modes).reshape(3, self.views, -1)
+        # A movement that shifts of the radiographs hardly imitate is no gauge of this scan, and its
+        # column, scaled up, would be noise.
+        shown = np.sqrt(np.mean(np.sum(columns[:2] ** 2, axis=0), axis=0))
+        imitated = shown >= _IMITATED * self._sizes(geometry, np.asarray(points))
+        if magnification:
+            imitated[self.modes.index("scale")] = True
+        self._design = _rows(columns * imitated, self._weight)
+
+    def _sizes(self, geometry: ConeBeamGeometry, points: Floats) -> Floats:
+        """RMS displacement of the points on the panel for a unit of each mode [pixel]."""
+        pixel = np.linalg.norm(geometry.u, axis=1) * geometry.source_to_axis
+        per_mm = float(np.median(geometry.source_to_detector / pixel))
+        fields = (mode_field(mode, points) for mode in self.modes)
+        return np.array([per_mm * np.sqrt(np.mean(np.sum(f**2, axis=1))) for f in fields])
+
+    def fit(self, motion: Motion) -> GaugeFit:
+        """Split a motion, or the difference of two, into its gauge and the rest.
+
+        Parameters
+        ----------
+        motion : Motion
+            Of the same views.
+
+        Returns
+        -------
+        GaugeFit
+            Least squares on the columns of `gauge_columns`.
+        """
+        if motion.views != self.views:
+            raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
+        design, weight = self._design, self._weight
+        table = _table(motion)
+        target = _rows(table.T, weight)
+        coefficients = _least_squares(design, target, 1e-9)
+        part = np.zeros_like(table)
+        fitted = (design @ coefficients).reshape(-1, self.views).T
+        part[:, weight > 0] = fitted / weight[weight > 0]
+        size = np.linalg.norm(design, axis=0)
+        alone = np.abs(design.T @ target) / np.where(size > 0, size, 1.0) / np.sqrt(self.views)
+        return GaugeFit(
+            coefficients=dict(zip(self.modes, coefficients.tolist(), strict=True)),
+            part=part,
+            remainder=table - part,
+            rms_by_mode=dict(zip(self.modes, alone.tolist(), strict=True)),
+        )
+
+    def anchored(self, motion: Motion) -> Motion:
+        """Return the motion without its gauge.
+
+        Parameters
+        ----------
+        motion : Motion
+            Of the same views.
+        """
+        rest = self.fit(motion).remainder
+        return Motion(shift_u=rest[:, 0], shift_v=rest[:, 1], magnification=1 + rest[:, 2])
+
+    def error(self, estimate: Motion, truth: Motion) -> MotionError:
+        """Compare an estimated motion with the true one, raw and gauge-free.
+
+        Parameters
+        ----------
+        estimate, truth : Motion
+            Of the same views.
+        """
+        if estimate.views != truth.views:
+            raise ValueError(f"estimate: found {estimate.views} views, expected {truth.views}")
+        difference = Motion(
+            shift_u=estimate.shift_u - truth.shift_u,
+            shift_v=estimate.shift_v - truth.shift_v,
+            magnification=1 + (estimate.magnification - truth.magnification),
+        )
+        free = np.abs(self.fit(difference).remainder)
+        raw = np.abs(_table(difference))
+        return MotionError(
+            *raw.mean(axis=0).tolist(),
+            *raw.std(axis=0).tolist(),
+            *free.mean(axis=0).tolist(),
+            *free.std(axis=0).tolist(),
+        )
+
+
+def gauge_fit(
+    geometry: ConeBeamGeometry, motion: Motion, points: ArrayLike, *, magnification: bool = True
+) -> GaugeFit:
+    """Fit the gauge modes to one motion; arguments as of :class:`Gauge`."""
+    return Gauge(geometry, points, magnification=magnification).fit(motion)
 
 
 def _modes(magnification: bool) -> tuple[str, ...]:
@@ -184,30 +257,8 @@ def motion_error(
     *,
     magnification: bool = True,
 ) -> MotionError:
-    """Compare an estimated motion with the true one, raw and gauge-free.
-
-    Parameters
-    ----------
-    estimate, truth : Motion
-        Of the same views.
-    geometry, points, magnification
-        As in `gauge_fit`.
-    """
-    if estimate.views != truth.views:
-        raise ValueError(f"estimate: found {estimate.views} views, expected {truth.views}")
-    difference = Motion(
-        shift_u=estimate.shift_u - truth.shift_u,
-        shift_v=estimate.shift_v - truth.shift_v,
-        magnification=1 + (estimate.magnification - truth.magnification),
-    )
-    free = np.abs(gauge_fit(geometry, difference, points, magnification=magnification).remainder)
-    raw = np.abs(_table(difference))
-    return MotionError(
-        *raw.mean(axis=0).tolist(),
-        *raw.std(axis=0).tolist(),
-        *free.mean(axis=0).tolist(),
-        *free.std(axis=0).tolist(),
-    )
+    """Compare one estimated motion with the true one; arguments as of :class:`Gauge`."""
+    return Gauge(geometry, points, magnification=magnification).error(estimate, truth)
 
 
 def without_gauge(

@@ -53,7 +53,7 @@ def gauge_columns(
         of movement: 1 mm, 1 rad, or 1 (a doubled size). Zero in a view that sees hardly any.
     """
     points = vectors("points", points, "points")
-    fields = np.concatenate([_field(mode, points) for mode in modes], axis=1)
+    fields = np.concatenate([mode_field(mode, points) for mode in modes], axis=1)
     to_pixels = geometry.projection_matrices()[:, :, :3].copy()
     # Pixels are counted from the panel's centre here, about which it is magnified.
     to_pixels[:, 0] -= (geometry.columns - 1) / 2 * to_pixels[:, 2]
@@ -68,8 +68,8 @@ def gauge_columns(
     return columns.reshape(3 * geometry.views, len(modes))
 
 
-def _field(mode: str, points: Floats) -> Floats:
-    """Movement of each point for a unit of a mode, (n, 3)."""
+def mode_field(mode: str, points: Floats) -> Floats:
+    """Return the movement of each point for a unit of a mode, (n, 3) [mm]."""
     if mode not in GAUGE_MODES:
         raise ValueError(f"modes: found {mode!r}, expected some of {GAUGE_MODES}")
     kind, _, axis = mode.partition(" ")

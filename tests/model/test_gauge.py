@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from clra.model.gauge import gauge_fit, motion_error, sample_points, without_gauge
+from clra.model.gauge import Gauge, gauge_fit, motion_error, sample_points, without_gauge
 from clra.model.gauge_modes import GAUGE_MODES, gauge_columns
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
@@ -264,3 +264,24 @@ def test_sample_points_fill_the_cylinder_of_the_grid():
     assert np.mean(z) == pytest.approx(0, abs=0.3)
     assert np.array_equal(cloud, sample_points(grid, count=4000))
     assert not np.array_equal(cloud, sample_points(grid, count=4000, seed=1))
+
+
+def test_anchoring_takes_out_what_the_sample_could_have_done() -> None:
+    geometry = helix(400, angle_step=0.2, z_step=0.014, **STAGE)
+    points = sample_points(default_grid(geometry))
+    columns = gauge_columns(geometry, points).reshape(3, 400, -1)
+    shift = columns[:2] @ [0.01, -0.02, 0.015, 0.002, 0.001, 0.0, 0.004]
+    moved = Motion(shift_u=shift[0], shift_v=shift[1])
+    anchored = Gauge(geometry, points, magnification=False).anchored(moved)
+    assert np.abs(shift).max() > 0.5
+    assert np.abs(anchored.shift_u).max() < 1e-9
+    assert np.abs(anchored.shift_v).max() < 1e-9
+
+
+def test_movements_that_shifts_cannot_imitate_are_no_gauge() -> None:
+    """On a circle whose views see all of the sample a tilt turns its image, it hardly shifts it."""
+    geometry = circular(90, **STAGE)
+    gauge = Gauge(geometry, sample_points(default_grid(geometry)), magnification=False)
+    wobble = np.sin(np.linspace(0, 2 * np.pi, 90, endpoint=False))
+    visible = Motion(shift_u=np.zeros(90), shift_v=wobble)
+    assert np.abs(gauge.anchored(visible).shift_v - wobble).max() < 0.02
