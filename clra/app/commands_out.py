@@ -31,6 +31,13 @@ def align(
     estimate: Annotated[
         str, typer.Option(metavar="shift|shift+scale", help="What moves in a radiograph.")
     ] = "shift+scale",
+    gauge: Annotated[
+        str,
+        typer.Option(
+            metavar="anchored|free",
+            help="Take out of the motion, or leave in, what a movement of the sample explains.",
+        ),
+    ] = "anchored",
     report: Annotated[
         Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
     ] = None,
@@ -61,8 +68,8 @@ def align(
     about = {
         "file": str(scan.absolute()),
         "estimate": estimate,
-        "command": f"clra align {scan} -o {out} --schedule {schedule} --estimate {estimate}"
-        f"{reading.as_typed()}",
+        "command": f"clra align {scan} -o {out} --schedule {schedule} --estimate {estimate} "
+        f"--gauge {gauge}{reading.as_typed()}",
     }
     with console.progress() as progress:
         try:
@@ -70,6 +77,7 @@ def align(
                 opened,
                 schedule=schedule,
                 estimate=estimate,
+                gauge=gauge,
                 device=console.device,
                 progress=progress,
             )
@@ -103,7 +111,12 @@ def reconstruct(
         typer.Option("--output", "-o", metavar="VOLUME", help="Volume to write: .h5 or .tif."),
     ],
     method: Annotated[
-        str, typer.Option(metavar="fbp", help="Ramp-filtered back-projection.")
+        str,
+        typer.Option(
+            metavar="fbp|katsevich",
+            help="Ramp-filtered back-projection, for any trajectory, or Katsevich's exact one, for "
+            "helices.",
+        ),
     ] = "fbp",
     motion: MotionPath = None,
     align: Annotated[
@@ -112,13 +125,14 @@ def reconstruct(
 ) -> None:
     """Reconstruct a volume.
 
-    Covers the whole field of view, in 1/mm. The motion goes into the geometry: no radiograph is
-    resampled.
+    Covers the whole field of view, in 1/mm. With fbp the motion goes into the geometry: no
+    radiograph is resampled. With katsevich each is resampled once.
 
     Examples
     --------
       clra reconstruct scan.nxs -o volume.h5 --motion motion.h5
       clra reconstruct scan.nxs -o volume.tif --align
+      clra reconstruct helix.nxs -o volume.h5 --method katsevich --align
     """
     from clra.app.arguments import volume_file
     from clra.app.describe import metric

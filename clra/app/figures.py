@@ -17,7 +17,6 @@ from matplotlib.ticker import (
 )
 from numpy.typing import NDArray
 
-from clra.app.describe import metric
 from clra.methods.results import Iteration
 from clra.model.motion import Motion
 
@@ -52,10 +51,22 @@ _STYLE: Any = {
 _MOST_VECTOR_POINTS = 3000
 
 
-def _drawn(
+def drawn(
     draw: Callable[[Figure], None], size: tuple[float, float], kind: str, dpi: int = 150
 ) -> str:
-    """Draw a figure of that size [inch] and return it as the address of an <img>."""
+    """Draw a figure and return it as the data address of an ``<img>``.
+
+    Parameters
+    ----------
+    draw : callable
+        Given the figure to draw on.
+    size : (float, float)
+        Width and height [inch].
+    kind : {"svg", "png"}
+        Format.
+    dpi : int
+        Pixels an inch, of what is not vectors.
+    """
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         draw(figure)
@@ -115,7 +126,7 @@ def corrections(motion: Motion) -> str:
         for axes in (left, right):
             axes.set_xlim(-0.5, motion.views - 0.5)
 
-    return _drawn(draw, (10.4, 3.5), "svg")
+    return drawn(draw, (10.4, 3.5), "svg")
 
 
 def convergence(history: Sequence[Iteration]) -> str:
@@ -147,7 +158,7 @@ def convergence(history: Sequence[Iteration]) -> str:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             _mark_levels(axes, [iteration.level for iteration in history])
 
-    return _drawn(draw, (10.4, 3.5), "svg")
+    return drawn(draw, (10.4, 3.5), "svg")
 
 
 def _logarithmic(axes: Any) -> None:
@@ -256,7 +267,7 @@ def confidence(values: Floats, flagged: Sequence[int]) -> str:
         axes.set_xlim(-0.5, len(values) - 0.5)
         axes.set(xlabel="view", ylabel="confidence", title="Confidence of each view")
 
-    return _drawn(draw, (10.4, 2.4), "svg")
+    return drawn(draw, (10.4, 2.4), "svg")
 
 
 def error_of_views(raw: Floats, gauge_free: Floats) -> str:
@@ -287,67 +298,4 @@ def error_of_views(raw: Floats, gauge_free: Floats) -> str:
             _legend(axes)
         figure.axes[0].set_ylabel("estimate - truth [pixel]")
 
-    return _drawn(draw, (10.4, 3.2), "svg")
-
-
-def images(pictures: Sequence[tuple[str, Floats, tuple[float, float]]], pixel_mm: float) -> str:
-    """Draw grey pictures side by side, each with a scale bar.
-
-    Parameters
-    ----------
-    pictures : sequence of (str, ndarray, (float, float))
-        Title, 2-D image, and the values that are black and white.
-    pixel_mm : float
-        Edge of a pixel [mm].
-
-    Returns
-    -------
-    str
-        Data address of an image.
-    """
-    ratios = [image.shape[1] / image.shape[0] for _, image, _ in pictures]
-    height = min(10.2 / sum(ratios), 7.0)
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, len(pictures), width_ratios=ratios, squeeze=False)[0]
-        for axes, (title, image, (black, white)) in zip(panels, pictures, strict=True):
-            axes.imshow(image, cmap="gray", vmin=black, vmax=white, interpolation="nearest")
-            axes.set_title(title)
-            axes.axis("off")
-            _scale_bar(axes, image.shape, pixel_mm)
-
-    return _drawn(draw, (10.4, height + 0.35), "png")
-
-
-def _scale_bar(axes: Any, shape: tuple[int, ...], pixel_mm: float) -> None:
-    """Draw a bar of a round length, about a fifth of the picture's width."""
-    rows, columns = shape
-    wanted = 0.22 * columns * pixel_mm
-    decade = 10.0 ** np.floor(np.log10(wanted))
-    length = decade * max(step for step in (1.0, 2.0, 5.0) if step * decade <= wanted * 1.0001)
-    left, bottom = 0.04 * columns, rows - 0.05 * min(rows, columns) - 1
-    bar = length / pixel_mm
-    outline = {"facecolor": "black", "alpha": 0.45, "edgecolor": "none", "pad": 2.0}
-    axes.plot([left, left + bar], [bottom, bottom], color="white", lw=3, solid_capstyle="butt")
-    axes.text(
-        left,
-        bottom - 0.025 * min(rows, columns),
-        metric(float(length)).replace("um", "\u00b5m"),
-        color="white",
-        ha="left",
-        va="bottom",
-        fontsize=9,
-        bbox=outline,
-    )
-
-
-def grey_limits(image: Floats) -> tuple[float, float]:
-    """Values of which all but 1 % of the pixels at either end are inside.
-
-    Parameters
-    ----------
-    image : ndarray
-        What the grey scale has to suit.
-    """
-    low, high = np.percentile(image, (0.5, 99.5))
-    return (float(low), float(high)) if high > low else (float(low) - 1, float(low) + 1)
+    return drawn(draw, (10.4, 3.2), "svg")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clra.app import figures, page
+from clra.app import figures, page, pictures
 from clra.app.findings import Errors, Findings
 from clra.app.progress import duration
 from clra.app.records import Record
@@ -181,11 +181,11 @@ def _pictures(comparison: "Comparison | None") -> list[str]:
     if comparison is None:
         return [page.section("Before and after", page.paragraph(_WITHOUT_SCAN))]
     flat, tall, detail = comparison.horizontal, comparison.vertical, comparison.detail
-    limits = figures.grey_limits(flat.after)
+    limits = pictures.grey_limits(flat.after)
     slices = page.section(
         "Before and after",
         page.figure(
-            figures.images(
+            pictures.images(
                 [("Across the axis, before", flat.before, limits), ("After", flat.after, limits)],
                 comparison.voxel_mm,
             ),
@@ -194,7 +194,7 @@ def _pictures(comparison: "Comparison | None") -> list[str]:
             "Horizontal slices before and after alignment",
         ),
         page.figure(
-            figures.images(
+            pictures.images(
                 [("Detail, before", detail.before, limits), ("After", detail.after, limits)],
                 comparison.voxel_mm,
             ),
@@ -202,7 +202,7 @@ def _pictures(comparison: "Comparison | None") -> list[str]:
             "Detail before and after alignment",
         ),
         page.figure(
-            figures.images(
+            pictures.images(
                 [("Along the axis, before", tall.before, limits), ("After", tall.after, limits)],
                 comparison.voxel_mm,
             ),
@@ -219,8 +219,8 @@ def _pictures(comparison: "Comparison | None") -> list[str]:
 def _match(match: "Match", pixel_mm: float) -> str:
     before, after = match.difference.before, match.difference.after
     reach = max(float(np.percentile(np.abs(before), 99.5)), 1e-6)
-    grey = figures.grey_limits(match.measured)
-    drawn = figures.images(
+    grey = pictures.grey_limits(match.measured)
+    drawn = pictures.images(
         [
             ("Measured", match.measured, grey),
             ("Re-projected, after", match.reprojected, grey),

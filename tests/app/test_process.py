@@ -48,14 +48,14 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        # a shell's background job ignores Ctrl-C, and its children inherit that
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    for _ in range(600):
-        if any(tmp_path.iterdir()):
-            break
-        time.sleep(0.05)
-    time.sleep(0.3)
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("writing: ")
+    assert any(tmp_path.iterdir())
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, err
     assert out == "" and err.splitlines()[-1].startswith("interrupted: ")
     assert list(tmp_path.iterdir()) == []
