@@ -59,8 +59,8 @@ def import_frames(
     pixel_size : float or (float, float)
         Of the panel; (row, column) steps where they differ [mm].
     parallel : bool
-        The beam is parallel: a source so far away that no ray ends more than a hundredth of a pixel
-        from where it would, and the detector at the axis, so that a voxel is a pixel.
+        The beam is parallel: a source so far away that rays end within 1/8000 of the panel's width
+        of where parallel ones would, and the detector at the axis, so that a voxel is a pixel.
     flats, darks : path-like or list of path-like, optional
         Frames of the open beam, and without beam.
     shape : (int, int), optional

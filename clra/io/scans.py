@@ -46,8 +46,8 @@ def read_scan(
     source_distance : float, optional
         From the source to the rotation axis [mm], in place of the file's.
     parallel : bool
-        The beam is parallel: a source so far away that no ray ends more than a hundredth of a pixel
-        from where it would, and the detector at the axis.
+        The beam is parallel: a source so far away that rays end within 1/8000 of the panel's width
+        of where parallel ones would, and the detector at the axis.
     white : float, optional
         Counts of the open beam, in place of flat frames; 1 for radiographs that hold transmission.
 
