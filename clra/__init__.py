@@ -23,6 +23,7 @@ _HOMES = {
     "devices": "clra.ops.opencl",
     "ForwardProjector": "clra.ops.projector",
     "BackProjector": "clra.ops.projector",
+    "as_linear_operator": "clra.ops.linear",
 }
 
 __all__ = ["kernels", *_HOMES]

@@ -132,19 +132,22 @@ kernel void spectrum_to_work(
 kernel void multiply_spectrum(
     global float2 *restrict spectrum, // half spectrum
     const ulong spectrum_offset,
-    global const float *restrict multiplier, // (rows or 1, columns/2 + 1)
-    const ulong multiplier_offset,
+    global const float *restrict multiplier, // (rows or 1, columns/2 + 1, parts)
+    const ulong multiplier_offset, // in factors, of `parts` elements
+    const int parts, // 1: real factors, 2: complex ones
     const int columns, // of the real image
     const int rows,
     const int items,
     const int two_axes) // as in work_to_spectrum
 {
     spectrum += spectrum_offset;
-    multiplier += multiplier_offset;
+    multiplier += multiplier_offset * parts;
     const int half_width = columns / 2 + 1;
     const int k = get_global_id(0), row = get_global_id(1), item = get_global_id(2);
     if (k >= half_width || row >= rows || item >= items)
         return;
-    const float factor = multiplier[(two_axes ? (ulong)row * half_width : 0) + k];
-    spectrum[((ulong)item * rows + row) * half_width + k] *= factor;
+    const ulong n = (two_axes ? (ulong)row * half_width : 0) + k;
+    const ulong at = ((ulong)item * rows + row) * half_width + k;
+    spectrum[at] = parts == 2 ? product(spectrum[at], vload2(n, multiplier))
+                              : spectrum[at] * multiplier[n];
 }

@@ -5,12 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
 from clra.ops import opencl
+from clra.ops.bandpass_tables import plane_fit, reciprocal, spline_table
 from clra.ops.blur import gaussian_taps
-from clra.ops.lines import MARGIN, lanes, line_stride, lined, lined_zeros
+from clra.ops.lines import MARGIN, lanes, line_stride, lined
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 
 # Variance of the cubic B-spline, in squares of its knots' distance.
@@ -18,8 +20,6 @@ _SPLINE = 1 / 3
 # As in bandpass.cl: blocks before the first, and one more behind the last.
 _RIM = 2
 LEAST_LOW_PASS, LARGEST_LOW_PASS = 0.6, MARGIN / 4
-
-Floats = NDArray[np.float64]
 
 
 class Bandpass:
@@ -49,6 +49,8 @@ class Bandpass:
         used, see the attribute of this name.
     mask : array_like of bool, optional
         (rows, columns), True where pixels count, for all images.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
     Attributes
     ----------
@@ -60,6 +62,8 @@ class Bandpass:
         As used.
     scratch : cl.array.Array
         Lined images that are free between calls.
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
 
     Raises
     ------
@@ -76,6 +80,7 @@ class Bandpass:
         low_pass: float = 1.0,
         high_pass: float = 16.0,
         mask: ArrayLike | None = None,
+        allocator: Allocator | None = None,
     ) -> None:
         rows, columns = self.shape = shape
         self.low_pass, self.high_pass = low_pass, min(high_pass, min(shape) / 4)
@@ -110,18 +115,21 @@ class Bandpass:
         means[_RIM : _RIM + cut[0], _RIM : _RIM + cut[2]] = complete.mean((1, 3))
         self._narrow, self._wide = to_device(context, narrow), to_device(context, wide)
         self._mask = to_device(context, lined(counts))
-        self._scale = to_device(context, lined(_reciprocal(counts, narrow)))
-        self._fit = to_device(context, np.stack([lined(image) for image in _fit(means, wide)]))
+        self._scale = to_device(context, lined(reciprocal(counts, narrow)))
+        self._fit = to_device(context, np.stack([lined(image) for image in plane_fit(means, wide)]))
         self._lanes = lanes(context)
-        weights, bases = _spline_table(columns, factor, self._lanes)
+        weights, bases = spline_table(columns, factor, self._lanes, _RIM)
         self._weights, self._bases = (
             to_device(context, lined(weights)),
             to_device(context, bases, np.int32),
         )
+        self._memory = Scratch(context, allocator)
         self.scratch = self.empty()
         self._means, self._zeroth, self._first = (
-            lined_zeros(context, views, *coarse) for _ in range(3)
+            self._memory.zeros((views, coarse[0], self._coarse_stride)) for _ in range(3)
         )
+        own = 4 * views * (rows + coarse[0]) * self.stride
+        self.scratch_bytes = self._memory.bytes + own
         self._own: tuple[Array, Array] | None = None
         self._last: list[cl.Event] = []
 
@@ -140,11 +148,11 @@ class Bandpass:
 
     def empty(self) -> Array:
         """Lined images (views, rows, stride), zero."""
-        return lined_zeros(self._context, self._views, *self.shape)
+        return self._memory.zeros((self._views, self.shape[0], self.stride))
 
     def empty_expanded(self) -> Array:
         """Lined images (views, coarse rows, stride) for the wide part, zero."""
-        return lined_zeros(self._context, self._views, self._coarse[0], self.shape[1])
+        return self._memory.zeros((self._views, self._coarse[0], self.stride))
 
     def __call__(
         self,
@@ -175,6 +183,7 @@ class Bandpass:
         TypeError, ValueError
             If an array is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         n = len(images) if getattr(images, "ndim", 0) == 3 else 0
         opencl.check_array("images", images, (n, *self.shape), context=self._context)
         if not 1 <= n <= self._views:
@@ -223,7 +232,7 @@ class Bandpass:
             (coarse[1], coarse[0], n),
             *(self._means, images, self._mask, rows, columns, stride, factor),
             *(*coarse, coarse_stride, masked, n),
-            wait_for=[*(wait_for or ()), *self._last],
+            wait_for=self._memory.cleared(queue, [*(wait_for or ()), *self._last]),
         )
         blocks = -(-coarse[1] // self._lanes)
         event = step["wide_rows"](
@@ -293,54 +302,3 @@ class Bandpass:
             *(out, coefficients, rows, columns, self.stride, out_stride, out_lead, n),
             wait_for=wait_for,
         )
-
-
-def _reciprocal(counts: Floats, taps: Floats) -> Floats:
-    """1 / (mask convolved with the taps), 0 where a tenth of the neighbourhood or less counts."""
-    from scipy.ndimage import correlate1d
-
-    for axis in (0, 1):
-        counts = correlate1d(counts, taps, axis, mode="constant")
-    return np.divide(1.0, counts, out=np.zeros_like(counts), where=counts > 0.1)
-
-
-def _fit(counts: Floats, taps: Floats) -> Floats:
-    """Factors (3, rows, columns) that make the fitted plane's value of the moments 1, u, v."""
-    from scipy.ndimage import correlate1d
-
-    place = np.arange(taps.size) - taps.size // 2
-
-    def moment(u: int, v: int) -> Floats:
-        part = correlate1d(counts, taps * place**v, 0, mode="constant")
-        return np.asarray(correlate1d(part, taps * place**u, 1, mode="constant"))
-
-    whole = moment(0, 0)
-    # Where pixels that count lie in one line or point, the plane's slope across it is let go.
-    flat = 1e-6 * whole
-    first_u, first_v, cross = moment(1, 0), moment(0, 1), moment(1, 1)
-    matrix = np.array(
-        [
-            [whole, first_u, first_v],
-            [first_u, moment(2, 0) + flat, cross],
-            [first_v, cross, moment(0, 2) + flat],
-        ]
-    ).transpose(2, 3, 0, 1)
-    matrix[whole < 1e-4] = np.eye(3)
-    factors = np.linalg.inv(matrix)[..., 0]
-    factors[whole < 1e-4] = 0
-    return np.asarray(factors.transpose(2, 0, 1))
-
-
-def _spline_table(columns: int, factor: int, block: int) -> tuple[Floats, NDArray[np.intp]]:
-    """Weights (span, columns) of coarse columns from each block's first on, and these (blocks,)."""
-    fine = np.arange(columns)
-    place = (fine - (factor - 1) / 2) / factor + _RIM
-    base = np.floor(place).astype(np.intp)
-    f = place - base
-    taps4 = [(1 - f) ** 3, 4 - 6 * f**2 + 3 * f**3, 1 + 3 * f + 3 * f**2 - 3 * f**3, f**3]
-    bases = base[::block] - 1
-    first = base - 1 - bases[fine // block]
-    weights = np.zeros((int(first.max()) + 4, columns))
-    for k, tap in enumerate(taps4):
-        weights[first + k, fine] = tap / 6
-    return weights, bases

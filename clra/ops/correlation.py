@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
 from clra.ops.lines import lanes, lined
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 from clra.ops.windows import tukey
 
@@ -32,6 +33,8 @@ class CorrelationPeak:
         Unit of these images' pixels, in which shifts are returned.
     whiten : bool
         Phase correlation: all spatial frequencies count alike.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
     Attributes
     ----------
@@ -50,6 +53,7 @@ class CorrelationPeak:
         reach: tuple[int, int],
         pixel: float = 1.0,
         whiten: bool = False,
+        allocator: Allocator | None = None,
     ) -> None:
         rows, columns = self.shape = (
             fast_length(context, shape[0]),
@@ -57,12 +61,13 @@ class CorrelationPeak:
         )
         self._reach = min(reach[0], (shape[0] - 1) // 2), min(reach[1], (shape[1] - 1) // 2)
         self._pixel, self._whiten = float(pixel), int(whiten)
-        self._fft = RealFFT(context, (views, rows, columns))
-        self.measured = Array(context, (views, rows, columns), np.float32)
-        self.simulated = Array(context, (views, rows, columns), np.float32)
-        self._spectra = [Array(context, self._fft.spectrum_shape, np.complex64) for _ in range(2)]
+        memory = Scratch(context, allocator)
+        self._fft = RealFFT(context, (views, rows, columns), allocator=memory)
+        self.measured = memory.empty((views, rows, columns))
+        self.simulated = memory.empty((views, rows, columns))
+        self._spectra = [memory.empty(self._fft.spectrum_shape, np.complex64) for _ in range(2)]
         self._cross_power = Step(context, "correlation.cl", "cross_power", (64,))
-        self._group = group(context)
+        self._group = group(context, "correlation.cl", "peak", 64)
         self._peak = Step(
             context, "correlation.cl", "peak", (self._group, 1), {"GROUP": self._group}
         )
@@ -122,15 +127,28 @@ class CoarseShift:
         Largest number of pairs.
     max_shift : float
         Largest shift looked for, pixels.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
     """
 
     def __init__(
-        self, context: cl.Context, weights: NDArray[np.float64], *, views: int, max_shift: float
+        self,
+        context: cl.Context,
+        weights: NDArray[np.float64],
+        *,
+        views: int,
+        max_shift: float,
+        allocator: Allocator | None = None,
     ) -> None:
         rows, columns = self._shape = weights.shape
         reach = math.ceil(max_shift / 2)
         self._peak = CorrelationPeak(
-            context, (rows // 2, columns // 2), views=views, reach=(reach, reach), pixel=2.0
+            context,
+            (rows // 2, columns // 2),
+            views=views,
+            reach=(reach, reach),
+            pixel=2.0,
+            allocator=allocator,
         )
         half = weights[: rows // 2 * 2 : 2, : columns // 2 * 2 : 2]
         self._window = to_device(context, lined(half))
@@ -197,6 +215,13 @@ class PhaseCorrelation:
         Pairs worked on at a time; larger batches are cut.
     max_shift : float, optional
         Largest shift looked for, pixels; half the image by default.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Of scratch memory.
     """
 
     def __init__(
@@ -206,16 +231,18 @@ class PhaseCorrelation:
         *,
         views: int = 16,
         max_shift: float | None = None,
+        allocator: Allocator | None = None,
     ) -> None:
         self._context, self._shape, self._views = context, shape, views
+        memory = Scratch(context, allocator)
         reach = max(shape) if max_shift is None else int(max_shift)
         self._correlation = CorrelationPeak(
-            context, shape, views=views, reach=(reach, reach), whiten=True
+            context, shape, views=views, reach=(reach, reach), whiten=True, allocator=memory
         )
         self._windows = [to_device(context, tukey(length, 0.35)) for length in shape]
-        self._mean = [Array(context, (views,), np.float32) for _ in range(2)]
-        size = group(context)
-        self._group = size
+        self._mean = [memory.empty((views,)) for _ in range(2)]
+        self.scratch_bytes = memory.bytes
+        size = self._group = group(context, "correlation.cl", "means", 64)
         self._means = Step(context, "correlation.cl", "means", (size, 1), {"GROUP": size})
         self._windowed = Step(context, "correlation.cl", "windowed", (32, 4, 1))
         self._last: list[cl.Event] = []
@@ -251,6 +278,7 @@ class PhaseCorrelation:
         TypeError, ValueError
             If an array is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         n = check_pair(self._context, self._shape, measured, simulated)
         opencl.check_array("shifts_out", shifts_out, (n, 2), context=self._context)
         for start in range(0, n, self._views):
@@ -287,9 +315,15 @@ class PhaseCorrelation:
         )
 
 
-def group(context: cl.Context) -> int:
-    """Work-items that share the work of one view."""
-    return 1 if opencl.is_cpu(opencl.device_of(context)) else 64
+def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
+    """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
+    size = 1 if opencl.is_cpu(opencl.device_of(context)) else wanted
+    while size > 1:
+        kernel = opencl.kernel(context, file, function, {"GROUP": size})
+        if all(opencl.work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
+            break
+        size //= 2
+    return size
 
 
 def check_pair(

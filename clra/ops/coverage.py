@@ -10,6 +10,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops import opencl
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
@@ -38,6 +39,13 @@ class Coverage:
         Of the volume.
     row_weight : array_like, (rows,)
         By which the rows of each projection were multiplied.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Of scratch memory, which holds W.
 
     Raises
     ------
@@ -51,6 +59,8 @@ class Coverage:
         geometry: ConeBeamGeometry,
         grid: VolumeGrid,
         row_weight: ArrayLike,
+        *,
+        allocator: Allocator | None = None,
     ) -> None:
         weights = np.asarray(row_weight, np.float64)
         if weights.shape != (geometry.rows,):
@@ -64,7 +74,8 @@ class Coverage:
         self._coarse = (-(-nx // _ACROSS), -(-ny // _ACROSS), -(-nz // _ALONG))
         self._matrices = to_device(context, self._coarse_matrices(geometry))
         self._weights = to_device(context, np.resize(weights, self._panel[1]))
-        self._seen = Array(context, self._coarse[1::-1] + self._coarse[2:], np.float32)
+        self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
+        self.scratch_bytes = self._seen.nbytes
         self._least = _LEAST * _most_views(geometry, weights)
         radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
         self._radius = radius / grid.voxel_size
@@ -96,6 +107,7 @@ class Coverage:
         -------
         cl.Event
         """
+        opencl.check_queue(queue, self._context)
         nx, ny, nz = self._coarse
         event = self._count(
             queue,
@@ -152,6 +164,7 @@ class Coverage:
         TypeError, ValueError
             If the volume is not of this grid.
         """
+        opencl.check_queue(queue, self._context)
         planes, ny, nx = self._grid.shape
         slices = volume_order == "zyx"
         if getattr(volume, "ndim", 0) == 3:

@@ -14,6 +14,7 @@ from pyopencl.array import Array
 from clra.ops import opencl
 from clra.ops.fft_device import DeviceFFT
 from clra.ops.fft_host import HostFFT
+from clra.ops.scratch import Allocator
 
 BACKENDS = ("scipy", "reikna")
 
@@ -59,11 +60,15 @@ class RealFFT:
         ``(1, 2)`` for rows and columns, ``(2,)`` for columns only.
     backend : {"scipy", "reikna"}, optional
         None: "scipy" on a CPU device, "reikna" elsewhere.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
     Attributes
     ----------
     shape, spectrum_shape : tuple of int
         Of the images and of their spectra, (n, rows, columns) and (n, rows, columns // 2 + 1).
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes, without what reikna's transform keeps.
 
     Raises
     ------
@@ -77,6 +82,8 @@ class RealFFT:
         shape: tuple[int, int, int],
         axes: Sequence[int] = (1, 2),
         backend: str | None = None,
+        *,
+        allocator: Allocator | None = None,
     ) -> None:
         if len(shape) != 3 or min(shape) < 1:
             raise ValueError(f"shape: found {shape}, expected three positive numbers")
@@ -86,8 +93,14 @@ class RealFFT:
         self.spectrum_shape = (*shape[:2], shape[2] // 2 + 1)
         self._context = context
         self._multiplier_shape = self.spectrum_shape[3 - len(axes) :]
-        backend_class = HostFFT if _backend(context, backend) == "scipy" else DeviceFFT
-        self._backend: _Backend = backend_class(context, shape, tuple(axes))
+        self._backend: _Backend
+        if _backend(context, backend) == "scipy":
+            self.scratch_bytes = 0
+            self._backend = HostFFT(context, shape, tuple(axes))
+        else:
+            transform = DeviceFFT(context, shape, tuple(axes), allocator)
+            self.scratch_bytes = transform.scratch_bytes
+            self._backend = transform
 
     def forward(
         self,
@@ -118,6 +131,7 @@ class RealFFT:
         TypeError, ValueError
             If an array is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         n = self._count(image)
         self._check("image", image, (n, *self.shape[1:]))
         self._check("spectrum_out", spectrum_out, (n, *self.spectrum_shape[1:]), np.complex64)
@@ -134,6 +148,7 @@ class RealFFT:
 
         The spectrum has to be that of a real image; it is not changed.
         """
+        opencl.check_queue(queue, self._context)
         n = self._count(image_out)
         self._check("image_out", image_out, (n, *self.shape[1:]))
         self._check("spectrum", spectrum, (n, *self.spectrum_shape[1:]), np.complex64)
@@ -158,8 +173,8 @@ class RealFFT:
         image : Array
             float32 (n, rows, columns).
         multiplier : Array
-            float32 factors of the spectrum, (columns // 2 + 1,) where columns are transformed,
-            (rows, columns // 2 + 1) where rows are too.
+            float32 or complex64 factors of the spectrum, (columns // 2 + 1,) where columns are
+            transformed, (rows, columns // 2 + 1) where rows are too.
         wait_for : sequence of cl.Event, optional
             What has to be done before.
 
@@ -172,10 +187,13 @@ class RealFFT:
         TypeError, ValueError
             If an array is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         n = self._count(image)
         self._check("image", image, (n, *self.shape[1:]))
         self._check("image_out", image_out, (n, *self.shape[1:]))
-        self._check("multiplier", multiplier, self._multiplier_shape)
+        complex_factors = getattr(multiplier, "dtype", None) == np.complex64
+        dtype = np.complex64 if complex_factors else np.float32
+        self._check("multiplier", multiplier, self._multiplier_shape, dtype)
         return self._backend.apply(queue, image_out, image, multiplier, list(wait_for or ()))
 
     def _count(self, image: Any) -> int:

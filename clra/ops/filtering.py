@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
@@ -84,6 +85,8 @@ class RampFilter:
         value to 0 as a squared cosine: for samples that are wider than the panel.
     backend : {"scipy", "reikna"}, optional
         As for :class:`clra.ops.fft.RealFFT`; with "scipy" a call blocks the host.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
     Attributes
     ----------
@@ -91,6 +94,8 @@ class RampFilter:
         As given.
     padded : int
         Columns of a line in the transforms, at least twice those of the panel.
+    scratch_bytes : int
+        Of scratch memory.
 
     Raises
     ------
@@ -112,25 +117,29 @@ class RampFilter:
         window: str = "ram-lak",
         extend: bool = False,
         backend: str | None = None,
+        allocator: Allocator | None = None,
     ) -> None:
         if window not in WINDOWS:
             raise ValueError(f"window: found {window!r}, expected one of {', '.join(WINDOWS)}")
         self.window = window
-        self._context, self._backend = context, backend
+        self._context = context
         self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
         margin = math.ceil(_EXTENSION * self._columns) if extend else 0
         self.padded = fast_length(context, 2 * (self._columns + margin), backend)
         cpu = opencl.is_cpu(opencl.device_of(context))
         self._lanes = 8 if cpu else 2
-        scratch = _CPU_BYTES if cpu else _GPU_BYTES
-        self._most_lines = min(max(1, scratch // (4 * self.padded)), _MOST_LINES)
+        most = max(1, (_CPU_BYTES if cpu else _GPU_BYTES) // (4 * self.padded))
+        lines = (min(self._views * self._rows, most, _MOST_LINES), 1, self.padded)
+        memory = Scratch(context, allocator)
+        self._lines = memory.empty(lines)
+        self._fft = RealFFT(context, lines, (2,), backend, allocator=memory)
+        self.scratch_bytes = self._lines.nbytes + self._fft.scratch_bytes
         defines = {"LANES": self._lanes}
         self._weight = Step(context, "filtering.cl", "weight_lines", (64, 2), defines)
         self._cut = Step(context, "filtering.cl", "cut_lines", (64, 2), defines)
         self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
         self._roll = to_device(context, _roll(self.padded - self._columns, margin))
         self._ramp = to_device(context, _ramp_spectrum(self.padded, window))
-        self._lines: Array | None = None
         self._last: list[cl.Event] = []
         self.set_geometry(geometry)
 
@@ -183,6 +192,7 @@ class RampFilter:
         TypeError, ValueError
             If an argument is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         start, stop, step = (views or slice(None)).indices(self._views)
         if step != 1 or stop <= start:
             raise ValueError(f"views: found {views}, expected some successive views")
@@ -190,12 +200,11 @@ class RampFilter:
         opencl.check_array("projections", projections, shape, context=self._context)
         opencl.check_array("filtered_out", filtered_out, shape, context=self._context)
         total = shape[0] * self._rows
-        lines, fft = self._scratch(min(total, self._most_lines))
         events = [*(wait_for or ()), *self._last]
         sizes = (self._columns, self.padded)
-        for first in range(0, total, len(lines)):
-            count = min(len(lines), total - first)
-            part = lines[:count]
+        for first in range(0, total, len(self._lines)):
+            count = min(len(self._lines), total - first)
+            part = self._lines[:count]
             event = self._weight(
                 queue,
                 (-(-self.padded // self._lanes), count),
@@ -210,7 +219,7 @@ class RampFilter:
                 *sizes,
                 wait_for=events,
             )
-            event = fft.apply(queue, part, part, self._ramp, [event])
+            event = self._fft.apply(queue, part, part, self._ramp, [event])
             event = self._cut(
                 queue,
                 (-(-self._columns // self._lanes), count),
@@ -224,14 +233,6 @@ class RampFilter:
             events = [event]
         self._last = events
         return event
-
-    def _scratch(self, lines: int) -> tuple[Array, RealFFT]:
-        """Hold the padded lines and their transform, larger ones where a call brings more."""
-        if self._lines is None or len(self._lines) < lines:
-            shape = (lines, 1, self.padded)
-            self._lines = Array(self._context, shape, np.float32)
-            self._fft = RealFFT(self._context, shape, (2,), self._backend)
-        return self._lines, self._fft
 
 
 def _row_weights(row_weight: ArrayLike | None, rows: int) -> NDArray[np.float32]:

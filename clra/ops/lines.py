@@ -3,10 +3,8 @@
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
-from pyopencl.array import Array
 
 from clra.ops import opencl
-from clra.ops.steps import to_device
 
 # As in lanes.clh.
 MARGIN = 16
@@ -28,8 +26,3 @@ def lined(image: NDArray[np.generic]) -> NDArray[np.float32]:
     out = np.zeros((rows, line_stride(columns)), np.float32)
     out[:, MARGIN : MARGIN + columns] = image
     return out
-
-
-def lined_zeros(context: cl.Context, *shape: int) -> Array:
-    """Lined images of zeros, of which the last two of `shape` are rows and columns."""
-    return to_device(context, np.zeros((*shape[:-1], line_stride(shape[-1]))))

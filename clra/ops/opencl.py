@@ -221,7 +221,10 @@ def _compile_once(context: cl.Context, name: str, options: Sequence[str]) -> cl.
         program.build(" ".join(options).encode())
     except cl.Error as error:
         raise KernelBuildError(f"kernel {name} does not build: {error}") from None
-    return cl.Program(program)
+    built = cl.Program(program)
+    # pyopencl would look for a kernel of this name, an error that API checkers complain of.
+    built._source = kernels.source(name)
+    return built
 
 
 def kernel(
@@ -270,6 +273,12 @@ def check_array(
         raise ValueError(f"{name}: found strides {array.strides}, expected C order")
     if context is not None and array.context != context:
         raise ValueError(f"{name}: its context {array.context} is not the operator's {context}")
+
+
+def check_queue(queue: cl.CommandQueue, context: cl.Context) -> None:
+    """Refuse a queue of another context than an operator's, with a ValueError."""
+    if queue.context != context:
+        raise ValueError(f"queue: its context {queue.context} is not the operator's {context}")
 
 
 def buffer_argument(array: cl.array.Array) -> tuple[Any, np.uint64]:

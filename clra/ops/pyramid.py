@@ -28,6 +28,7 @@ class _Resampling:
         wait_for: Sequence[cl.Event] | None,
     ) -> cl.Event:
         """Run over the rows and planes of `out` and blocks of `columns` coarse columns."""
+        opencl.check_queue(queue, self._context)
         size = (-(-columns // self._lanes), out.shape[1], out.shape[0])
         return self._step(queue, size, out, source, *sizes, wait_for=wait_for)
 

@@ -11,8 +11,9 @@ from pyopencl.array import Array
 from clra.ops import opencl
 from clra.ops.bandpass import Bandpass
 from clra.ops.blur import Blur
-from clra.ops.correlation import CoarseShift, check_pair
-from clra.ops.lines import lanes, lined, lined_zeros
+from clra.ops.correlation import CoarseShift, check_pair, group
+from clra.ops.lines import lanes, line_stride, lined
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 from clra.ops.windows import registration_window
 
@@ -98,6 +99,13 @@ class Registration:
         shift 0. Worth it where shifts may exceed 2 pixels.
     max_shift : float
         Views that leave this range, pixels, stay with the best estimate before.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Of scratch memory.
 
     Raises
     ------
@@ -129,6 +137,7 @@ class Registration:
         spread: float = 0.0,
         coarse: bool = True,
         max_shift: float = 16.0,
+        allocator: Allocator | None = None,
     ) -> None:
         rows, columns = self.shape = shape
         if min(shape) < 16:
@@ -148,8 +157,15 @@ class Registration:
         if not spread >= 0:
             raise ValueError(f"spread: found {spread}, expected 0 or more")
         self._spread = float(spread)
+        memory = self._memory = Scratch(context, allocator)
         band = self._bandpass = Bandpass(
-            context, shape, views=views, low_pass=low_pass, high_pass=high_pass, mask=mask
+            context,
+            shape,
+            views=views,
+            low_pass=low_pass,
+            high_pass=high_pass,
+            mask=mask,
+            allocator=memory,
         )
         weights = registration_window(shape, margin, low_pass, mask)
         valid = np.ones(shape) if mask is None else np.asarray(mask) != 0
@@ -157,22 +173,24 @@ class Registration:
         self._box = _box(weights)
         self._blocks = -(-(self._box[1] - self._box[0]) // _BLOCK_ROWS)
         self._coarse = (
-            CoarseShift(context, weights, views=views, max_shift=max_shift) if coarse else None
+            CoarseShift(context, weights, views=views, max_shift=max_shift, allocator=memory)
+            if coarse
+            else None
         )
         self._measured, self._simulated = band.empty(), band.empty()
         self._wide = band.empty_expanded(), band.empty_expanded()
-        self._mixed = lined_zeros(context, 1 + len(_BLURS), views, rows, columns)
+        self._mixed = memory.zeros((1 + len(_BLURS), views, rows, line_stride(columns)))
         self._state, self._levels, self._shifts, self._sums = (
-            Array(context, (views, *item), np.float32)
-            for item in ((_STATE,), (2,), (2,), (self._blocks, _SUMS))
+            memory.empty((views, *item)) for item in ((_STATE,), (2,), (2,), (self._blocks, _SUMS))
         )
+        self.scratch_bytes = memory.bytes
         variances = np.array([0.0, *_BLURS]) ** 2
         self._blurs = [Blur(context, shape, math.sqrt(variance)) for variance in np.diff(variances)]
         # White noise of variance 1 a pixel has this covariance after two Gaussians.
         noise = 1 / (2 * math.pi * np.add.outer(variances, variances + 2 * low_pass**2))
         self._noise = to_device(context, noise)
 
-        self._group = 1 if cpu else 32
+        self._group = group(context, "registration.cl", "normal_equations", 32)
         defines = {"LANES": lanes(context), "GROUP": self._group}
         self._steps = {
             name: Step(context, "registration.cl", name, local, defines)
@@ -223,6 +241,7 @@ class Registration:
         TypeError, ValueError
             If an array is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         n = check_pair(self._context, self.shape, measured, simulated)
         opencl.check_array(
             "estimates_out", estimates_out, (n, len(ESTIMATE_FIELDS)), context=self._context
@@ -248,6 +267,7 @@ class Registration:
     ) -> cl.Event:
         """Band-pass both images, search the coarse shift, blur the measured image further."""
         n, band = len(measured), self._bandpass
+        wait_for = self._memory.cleared(queue, wait_for)
         event = band.coefficients(queue, self._measured, self._wide[0], measured, wait_for)
         event = band.coefficients(queue, self._simulated, self._wide[1], simulated, [event])
         event = band.values(queue, self._mixed[0], self._measured, n, [event])

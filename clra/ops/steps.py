@@ -20,7 +20,7 @@ class Step:
     file, function : str
         Kernel file and kernel.
     local : sequence of int
-        Work-group wanted; halved until the device allows it.
+        Work-group wanted; halved until the queue's device allows it.
     defines : mapping, optional
         Preprocessor definitions.
     """
@@ -34,7 +34,8 @@ class Step:
         defines: Mapping[str, object] | None = None,
     ) -> None:
         self._kernel = opencl.kernel(context, file, function, defines)
-        self._local = opencl.work_group_size(self._kernel, opencl.device_of(context), local)
+        self._wanted = tuple(local)
+        self._allowed: dict[cl.Device, tuple[int, ...]] = {}
 
     def __call__(
         self,
@@ -55,8 +56,13 @@ class Step:
                 values.append(np.float32(argument))
             else:
                 values.append(np.int32(argument))
+        device = queue.device
+        local = self._allowed.get(device)
+        if local is None:
+            local = opencl.work_group_size(self._kernel, device, self._wanted)
+            self._allowed[device] = local
         return self._kernel(
-            queue, opencl.global_size(size, self._local), self._local, *values, wait_for=wait_for
+            queue, opencl.global_size(size, local), local, *values, wait_for=wait_for
         )
 
 

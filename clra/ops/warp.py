@@ -8,6 +8,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.ops import opencl
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 
 # As in warp.cl and lanes.clh.
@@ -34,11 +35,15 @@ class Warp:
         Where the arrays live.
     shape : tuple of int
         (rows, columns) of the images.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
     Attributes
     ----------
     shape : tuple of int
         As given.
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes, with the first call of many images.
 
     Raises
     ------
@@ -51,7 +56,9 @@ class Warp:
        Processing Magazine 16(6), 22-38, 1999.
     """
 
-    def __init__(self, context: cl.Context, shape: tuple[int, int]) -> None:
+    def __init__(
+        self, context: cl.Context, shape: tuple[int, int], *, allocator: Allocator | None = None
+    ) -> None:
         if len(shape) != 2 or min(shape) < 1:
             raise ValueError(f"shape: found {shape}, expected two positive numbers")
         self.shape = shape
@@ -71,7 +78,9 @@ class Warp:
         self._resample_columns = step("resample_columns")
         taps = math.sqrt(3) * (math.sqrt(3) - 2) ** np.arange(_TAPS + 1.0)
         self._taps = to_device(context, taps)
-        self._coefficients: Array | None = None
+        self.scratch_bytes = 4 * self._most_views * rows * (columns + self._stride)
+        self._memory = Scratch(context, allocator)
+        self._images: tuple[Array, Array] | None = None
         self._last: list[cl.Event] = []
 
     def __call__(
@@ -106,6 +115,7 @@ class Warp:
         TypeError, ValueError
             If an array is none of the above.
         """
+        opencl.check_queue(queue, self._context)
         n = max(1, (getattr(measured, "shape", None) or (1,))[0])
         opencl.check_array("measured", measured, (n, *self.shape), context=self._context)
         opencl.check_array("corrected_out", corrected_out, (n, *self.shape), context=self._context)
@@ -161,8 +171,10 @@ class Warp:
 
     def _scratch(self, views: int) -> tuple[Array, Array]:
         """Hold two buffers for that many images, larger ones where a call brings more."""
-        if self._coefficients is None or len(self._coefficients) < views:
+        if self._images is None or len(self._images[0]) < views:
             rows, columns = self.shape
-            self._coefficients = Array(self._context, (views, rows, columns), np.float32)
-            self._lined = Array(self._context, (views, rows, self._stride), np.float32)
-        return self._coefficients, self._lined
+            self._images = (
+                self._memory.empty((views, rows, columns)),
+                self._memory.empty((views, rows, self._stride)),
+            )
+        return self._images

@@ -4,7 +4,7 @@ from scipy import ndimage
 
 from clra.ops import lines
 from clra.ops.blur import Blur, gaussian_taps
-from clra.ops.lines import MARGIN, lined, lined_zeros
+from clra.ops.lines import MARGIN, line_stride, lined
 from clra.ops.steps import to_device
 
 ROUNDING = 2e-6  # of values around 1
@@ -16,7 +16,8 @@ def test_is_the_mean_of_what_lies_on_the_panel(context, queue, monkeypatch, shap
     monkeypatch.setattr("clra.ops.blur.lanes", lambda context: lanes)
     images = np.random.default_rng(0).normal(size=(2, *shape))
     image = to_device(context, np.stack([lined(i) for i in images]))
-    out, between = (lined_zeros(context, 2, *shape) for _ in range(2))
+    blank = np.zeros((2, shape[0], line_stride(shape[1])))
+    out, between = to_device(context, blank), to_device(context, blank)
     Blur(context, shape, sigma)(queue, out, image, between, 2)
     taps = gaussian_taps(sigma)
     parts = np.ones(shape)

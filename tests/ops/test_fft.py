@@ -74,6 +74,17 @@ def test_apply_convolves_lines(context, queue, backend, in_place):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_apply_takes_complex_factors(context, queue, backend):
+    shape = (3, 5, 8)
+    image, kernel = image_of(shape), image_of((8,), seed=1).astype(float)
+    factors = with_offset(queue, np.fft.rfft(kernel).astype(np.complex64))
+    expected = np.fft.irfft(np.fft.rfft(image.astype(float)) * np.fft.rfft(kernel), 8)
+    out = cl_array.to_device(queue, image)
+    RealFFT(context, shape, (2,), backend).apply(queue, out, out, factors)
+    assert_close(out.get(), expected)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_apply_convolves_images(context, queue, backend):
     shape = (2, 4, 8)
     transform = RealFFT(context, shape, (1, 2), backend)

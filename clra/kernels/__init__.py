@@ -13,11 +13,11 @@ def path() -> Path:
     An installed wheel carries them inside the package, a checkout (also an editable install) at
     its top level.
     """
-    here = Path(__file__).resolve().parent
-    for folder in (here / "_kernels", here.parent / "kernels"):
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package / "_kernels", package.parent / "kernels"):
         if folder.is_dir():
             return folder
-    raise FileNotFoundError(f"no kernels beside {here}: the installation is incomplete")
+    raise FileNotFoundError(f"no kernels beside {package}: the installation is incomplete")
 
 
 def names() -> tuple[str, ...]:
