@@ -1,0 +1,61 @@
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from clra import kernels
+
+_FILE = Path(__file__).parents[2] / "tools" / "check_gpu.py"
+
+PTXAS = """\
+ptxas info    : 0 bytes gmem
+ptxas info    : Compiling entry function 'first' for 'sm_80'
+ptxas info    : Function properties for first
+    64 bytes stack frame, 8 bytes spill stores, 12 bytes spill loads
+ptxas info    : Used 80 registers, used 1 barriers, 1024 bytes smem, 432 bytes cmem[0]
+ptxas info    : Compiling entry function 'second' for 'sm_80'
+ptxas info    : Function properties for second
+    0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
+ptxas info    : Used 19 registers, used 0 barriers, 408 bytes cmem[0]
+"""
+
+
+@pytest.fixture(scope="module")
+def check_gpu():
+    spec = importlib.util.spec_from_file_location("check_gpu", _FILE)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["check_gpu"] = module  # where dataclass looks for the module's names
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["check_gpu"]
+
+
+def test_every_kernel_file_has_its_forms(check_gpu):
+    assert set(check_gpu.GPU_FORMS) == set(kernels.names())
+
+
+def test_ptxas_report(check_gpu):
+    first, second = check_gpu.read_ptxas(PTXAS, "warp.cl", "sm_80", 164 << 10)
+    assert (first.kernel, first.registers, first.spills) == ("warp.cl first", 80, 20)
+    assert (first.private, first.local) == (64, 1024)
+    assert (second.registers, second.spills, second.private, second.local) == (19, 0, 0, 0)
+    assert len(first.faults()) == 2
+    assert not second.faults()
+
+
+# From NVIDIA's occupancy calculator's rules, by hand.
+@pytest.mark.parametrize(
+    ("registers", "local", "work_items", "expected"),
+    [
+        (32, 0, 256, 1.0),
+        (33, 0, 256, 6 / 8),  # 40 registers a work-item: 51 warps, 6 groups of 8
+        (64, 0, 256, 0.5),
+        (16, 0, 32, 0.5),  # at most 32 groups
+        (16, 0, 1, 0.5),
+        (16, (81 << 10), 256, 2 / 8),  # 164 KiB hold two
+    ],
+)
+def test_occupancy(check_gpu, registers, local, work_items, expected):
+    found = check_gpu.occupancy(registers, local, work_items, 164 << 10)
+    assert found == pytest.approx(expected)
