@@ -6,13 +6,21 @@
 // whose v is parallel to z: the voxels of a column share g and the detector column, and row is
 // linear in z. So two adjacent detector columns are blended once and the blend is resampled.
 //
-// A work-item sums BLOCK voxels along z over the given views. Global sizes are (blocks, nx, ny),
-// rounded up at will. Every voxel has to be in front of every source (g > 0).
+// A work-item sums BLOCK voxels along z over the given views. Global sizes are (blocks, nx, ny), of
+// backproject_columns (blocks, STRIP, ny ceil(nx / STRIP)), rounded up at will. Every voxel has to be
+// in front of every source (g > 0).
 
 #include "geometry.clh"
 
 #ifndef BLOCK
 #define BLOCK (LANES == 1 ? 1 : 32 * LANES) // whole LANES
+#endif
+
+// Columns along x that backproject_columns treats for all y before it goes on: so what they see of
+// the projections stays in the cache. Half or twice as many change nothing; all of 448 halve the
+// speed for 16 views.
+#ifndef STRIP
+#define STRIP 32
 #endif
 
 static inline void put(
@@ -77,22 +85,7 @@ kernel void backproject_voxels(
             real value;
             if (bottom - top <= SPAN - 1.0f && last <= first + 2) {
                 const int base = below(top);
-                const real at = row - (float)base;
-                const whole n = to_whole(at);
-                const real f = at - to_real(n);
-                line += base;
-                value = hat(column - (float)first) * between(load_window(line), n, f);
-                line += pitch;
-                value += hat(column - (first + 1.0f)) * between(load_window(line), n, f);
-                if (last == first + 2) {
-                    // From one pixel before: clang makes permutations only where the subscripts
-                    // are computed, and this keeps it from using those of above.
-                    line += pitch - 1;
-                    const real at = row - (base - 1.0f);
-                    const whole n = to_whole(at);
-                    value += hat(column - (first + 2.0f)) *
-                             between(load_window(line), n, at - to_real(n));
-                }
+                value = among(line + base, pitch, column - (float)first, row - (float)base, last == first + 2);
             } else {
                 value = 0.0f;
                 for (int c = first; c <= last; ++c, line += pitch)
@@ -130,9 +123,9 @@ kernel void backproject_columns(
     projections += projections_offset + PAD;
     views += views_offset;
     const int z = get_global_id(0) * BLOCK;
-    const int x = get_global_id(1);
-    const int y = get_global_id(2);
-    if (z >= nz || x >= nx || y >= ny)
+    const int x = get_global_id(1) + get_global_id(2) / ny * STRIP;
+    const int y = get_global_id(2) % ny;
+    if (z >= nz || get_global_id(1) >= STRIP || x >= nx)
         return;
     const int voxels = min(BLOCK, nz - z);
     const float last_column = columns - 1;

@@ -8,10 +8,10 @@
 // their heights there are linear in the row. So two adjacent voxel columns are blended once and the
 // blend is resampled.
 //
-// A work-item makes BLOCK rows of one column from the planes from_plane to to_plane - 1, so that
-// the host can choose a part of the volume that stays in the cache for all views. Global sizes are
-// (blocks, columns, count), rounded up at will. Every voxel, and the one beyond, has to be in front
-// of every source.
+// A work-item makes BLOCK rows of one column. It sums over the planes from_plane to to_plane - 1 and
+// adds to what projections hold if from_plane > 0, so that the host can take the volume in parts
+// that stay in the cache for all views. Global sizes are (blocks, columns, count), rounded up at
+// will. Every voxel, and the one beyond, has to be in front of every source.
 
 #include "geometry.clh"
 
@@ -19,64 +19,94 @@
 #define BLOCK (LANES == 1 ? 1 : 48 * LANES) // whole LANES
 #endif
 
-// The volume and one view's rays in it.
+// The volume, part of its planes, and one view's rays.
 typedef struct {
     global const float *volume;
-    int shape[3];
-    size_t stride[3];
+    int nx;
+    int ny;
+    int nz;
     global const float *view;
     int from_plane;
     int to_plane;
 } scene;
 
-// where a ray is at `start + slope t` with -1 < . < size, t in planes
-static inline void clip(
-    const float start, const float slope, const int size, float *enter, float *leave)
+// voxels along an axis, and elements from one to the next
+static inline int size(const scene s, const int axis)
 {
-    const float one = (-1.0f - start) / slope;
-    const float other = (size - start) / slope;
-    *enter = fmax(*enter, fmin(one, other)); // these see to NaN, where the ray stays inside
-    *leave = fmin(*leave, fmax(one, other));
+    return axis == 0 ? s.nx : axis == 1 ? s.ny : s.nz;
 }
 
-// Sum of the samples of one ray (c, r), taken across `axis`.
-static inline float trace(const scene s, const float c, const float r, const int axis)
+static inline size_t stride(const scene s, const int axis)
 {
-    const int p = axis;
-    const int q = axis == 0 ? 1 : 0;
-    const int l = axis == 2 ? 1 : 2;
+    return axis == 0 ? (size_t)s.nz : axis == 1 ? (size_t)s.nz * s.nx : 1;
+}
+
+// the part of enter <= t <= leave with start + slope t > limit
+static inline void keep_above(
+    const float start, const float slope, const float limit, float *enter, float *leave)
+{
+    const float t = (limit - start) / slope;
+    if (slope > 0.0f)
+        *enter = LARGER(*enter, t);
+    else if (slope < 0.0f)
+        *leave = SMALLER(*leave, t);
+}
+
+// the part with start + slope t > -1 on one line and < size on the other
+static inline void keep_inside(
+    const float start,
+    const float high_slope,
+    const float low_slope,
+    const int size,
+    float *enter,
+    float *leave)
+{
+    keep_above(start, high_slope, -1.0f, enter, leave);
+    keep_above(-start, -low_slope, -size, enter, leave);
+}
+
+// Sum of the samples of one ray (c, r), taken across axis p.
+static inline float trace(const scene s, const float c, const float r, const int p)
+{
+    const int q = p == 0 ? 1 : 0;
+    const int l = p == 2 ? 1 : 2;
     const float start_p = s.view[12 + p];
     const float start_q = s.view[12 + q];
     const float start_l = s.view[12 + l];
     const float advance = ALONG(float, s.view, p, c, r);
     const float slope_q = ALONG(float, s.view, q, c, r) / advance;
     const float slope_l = ALONG(float, s.view, l, c, r) / advance;
+    const int end = min(s.to_plane, size(s, p)) - 1;
+    const int most_q = size(s, q) - 1;
+    const int most_l = size(s, l) - 1;
     float enter = s.from_plane - start_p;
-    float leave = min(s.to_plane, s.shape[p]) - 1 - start_p;
-    clip(start_q, slope_q, s.shape[q], &enter, &leave);
-    clip(start_l, slope_l, s.shape[l], &enter, &leave);
+    float leave = end - start_p;
+    keep_inside(start_q, slope_q, slope_q, most_q + 1, &enter, &leave);
+    keep_inside(start_l, slope_l, slope_l, most_l + 1, &enter, &leave);
     float sum = 0.0f;
     if (!(enter <= leave))
         return sum;
     // one plane more at each end, against rounding
     const int first = max((int)(enter + start_p), s.from_plane);
-    const int last = min((int)(leave + start_p) + 1, min(s.to_plane, s.shape[p]) - 1);
+    const int last = min((int)(leave + start_p) + 1, end);
+    const size_t stride_q = stride(s, q);
+    const size_t stride_l = stride(s, l);
     for (int plane = first; plane <= last; ++plane) {
         const float at_q = fma(plane - start_p, slope_q, start_q);
         const float at_l = fma(plane - start_p, slope_l, start_l);
-        if (!(at_q > -1.0f && at_q < s.shape[q] && at_l > -1.0f && at_l < s.shape[l]))
-            continue;
         const int iq = below(at_q);
         const int il = below(at_l);
-        const float high_q = iq + 1 < s.shape[q] ? at_q - iq : 0.0f;
-        const float high_l = il + 1 < s.shape[l] ? at_l - il : 0.0f;
+        if (iq < -1 || iq > most_q || il < -1 || il > most_l)
+            continue;
         const float low_q = iq < 0 ? 0.0f : 1.0f - (at_q - iq);
         const float low_l = il < 0 ? 0.0f : 1.0f - (at_l - il);
-        global const float *low = s.volume + plane * s.stride[p] + max(iq, 0) * s.stride[q];
-        global const float *high =
-            s.volume + plane * s.stride[p] + min(iq + 1, s.shape[q] - 1) * s.stride[q];
-        const size_t l0 = max(il, 0) * s.stride[l];
-        const size_t l1 = min(il + 1, s.shape[l] - 1) * s.stride[l];
+        const float high_q = iq < most_q ? at_q - iq : 0.0f;
+        const float high_l = il < most_l ? at_l - il : 0.0f;
+        global const float *line = s.volume + plane * stride(s, p);
+        global const float *low = line + max(iq, 0) * stride_q;
+        global const float *high = line + min(iq + 1, most_q) * stride_q;
+        const size_t l0 = max(il, 0) * stride_l;
+        const size_t l1 = min(il + 1, most_l) * stride_l;
         sum += low_q * (low_l * low[l0] + high_l * low[l1]) +
                high_q * (low_l * high[l0] + high_l * high[l1]);
     }
@@ -84,7 +114,7 @@ static inline float trace(const scene s, const float c, const float r, const int
 }
 
 #if LANES == 8
-// Sums of the samples of rays (c, r + lane), taken across `axis`, x or y, by all of them.
+// Sums of the samples of rays (c, r + lane), taken across axis p, x or y, by all of them.
 static inline float8 trace_lanes(const scene s, const float c, const float r, const int p)
 {
     const int q = 1 - p;
@@ -95,51 +125,44 @@ static inline float8 trace_lanes(const scene s, const float c, const float r, co
     const float8 advance = ALONG(float8, s.view, p, c, row);
     const float8 slope_q = ALONG(float8, s.view, q, c, row) / advance;
     const float8 slope_z = ALONG(float8, s.view, 2, c, row) / advance;
-    const float first_q = slope_q.s0, last_q = slope_q.s7;
-    const float first_z = slope_z.s0, last_z = slope_z.s7;
     const float begin = s.from_plane - start_p;
-    const float end = min(s.to_plane, s.shape[p]) - 1 - start_p;
+    const int end_plane = min(s.to_plane, size(s, p)) - 1;
+    const float end = end_plane - start_p;
+    const int most = size(s, q) - 1;
+    const size_t stride_q = stride(s, q);
+    // t = plane - start_p has one sign, so that an outer lane is the leftmost or lowest throughout
+    const float sign = begin + end > 0.0f ? 1.0f : -1.0f;
+    const float left_slope = sign * SMALLER(sign * slope_q.s0, sign * slope_q.s7);
+    const float right_slope = sign * LARGER(sign * slope_q.s0, sign * slope_q.s7);
+    const float low_slope = sign * SMALLER(sign * slope_z.s0, sign * slope_z.s7);
+    const float high_slope = sign * LARGER(sign * slope_z.s0, sign * slope_z.s7);
+    // planes where any lane can be within one voxel of the volume
+    float enter = begin, leave = end;
+    keep_inside(start_q, right_slope, left_slope, most + 1, &enter, &leave);
+    keep_inside(start_z, high_slope, low_slope, s.nz, &enter, &leave);
     float8 sum = 0.0f;
-    // planes where a ray may be in the volume: one lies between those of the outer lanes
-    float enter[2] = {begin, begin}, leave[2] = {end, end};
-    float enter_z[2] = {begin, begin}, leave_z[2] = {end, end};
-    clip(start_q, first_q, s.shape[q], enter, leave);
-    clip(start_q, last_q, s.shape[q], enter + 1, leave + 1);
-    clip(start_z, first_z, s.shape[2], enter_z, leave_z);
-    clip(start_z, last_z, s.shape[2], enter_z + 1, leave_z + 1);
-    const float in = LARGER(SMALLER(enter[0], enter[1]), SMALLER(enter_z[0], enter_z[1]));
-    const float out = SMALLER(LARGER(leave[0], leave[1]), LARGER(leave_z[0], leave_z[1]));
-    if (!(in <= out))
+    if (!(enter <= leave))
         return sum;
-    const int first = max((int)(in + start_p), s.from_plane);
-    const int last = min((int)(out + start_p) + 1, min(s.to_plane, s.shape[p]) - 1);
-    const int most = s.shape[q] - 1;
+    // one plane more at each end, against rounding
+    const int first = max((int)(enter + start_p), s.from_plane);
+    const int last = min((int)(leave + start_p) + 1, end_plane);
     for (int plane = first; plane <= last; ++plane) {
         const float t = plane - start_p;
-        const float one_q = fma(t, first_q, start_q), other_q = fma(t, last_q, start_q);
-        const float one_z = fma(t, first_z, start_z), other_z = fma(t, last_z, start_z);
-        const float left = SMALLER(one_q, other_q), right = LARGER(one_q, other_q);
-        const float bottom = SMALLER(one_z, other_z), top = LARGER(one_z, other_z);
-        if (right <= -1.0f || left > most + 1.0f || top <= -1.0f || bottom >= s.shape[2])
-            continue;
-        const float8 at_q = fma((float8)(t), slope_q, (float8)(start_q));
-        const float8 at_z = fma((float8)(t), slope_z, (float8)(start_z));
-        const int low = below(left);
-        const int high = below(right) + 1;
-        global const float *line = s.volume + plane * s.stride[p];
-        const int base = below(bottom);
-        if (top - bottom > SPAN || high > low + 1 || (uint)base > (uint)(s.shape[2] - WINDOW) || s.shape[2] < WINDOW || low < 0 || high > most) {
+        const float8 at_q = t * slope_q + start_q;
+        const float8 at_z = t * slope_z + start_z;
+        const int low = below(t * left_slope + start_q);
+        const int high = below(t * right_slope + start_q) + 1;
+        const int base = below(t * low_slope + start_z);
+        global const float *line = s.volume + plane * stride(s, p);
+        if (low >= 0 && high <= most && high <= low + 2 && base >= 0 &&
+            base <= s.nz - WINDOW && t * (high_slope - low_slope) <= SPAN - 1.0f) {
+            line += low * stride_q + base;
+            sum += among(
+                line, stride_q, at_q - (float)low, at_z - (float)base, high == low + 2);
+        } else {
             for (int i = max(low, 0); i <= min(high, most); ++i)
-                sum += hat(at_q - (float)i) * taps(line + i * s.stride[q], s.shape[2], at_z);
-            continue;
+                sum += hat(at_q - (float)i) * taps(line + i * stride_q, s.nz, at_z);
         }
-        const float8 at = at_z - (float)base;
-        const int8 n = convert_int8(at);
-        const float8 f = at - convert_float8(n);
-        line += low * s.stride[q] + base;
-        sum += hat(at_q - (float)low) * between(load_window(line), n, f);
-        line += s.stride[q];
-        sum += hat(at_q - (low + 1.0f)) * between(load_window(line), n, f);
     }
     return sum;
 }
@@ -169,15 +192,22 @@ kernel void forward_rays(
     const int view = get_global_id(2);
     if (first >= rows || c >= columns || view >= count)
         return;
-    scene s = {volume + volume_offset, {nx, ny, nz}, {nz, (size_t)nz * nx, 1}, views + views_offset + view * VIEW_FLOATS, from_plane, to_plane};
+    const scene s = {
+        volume + volume_offset,
+        nx,
+        ny,
+        nz,
+        views + views_offset + view * VIEW_FLOATS,
+        from_plane,
+        to_plane};
     global float *line = projections + ((size_t)view * (columns + 1) + c) * pitch;
     for (int r = first; r < min(first + BLOCK, rows); r += LANES) {
         real d[3];
         for (int axis = 0; axis < 3; ++axis)
             d[axis] = ALONG(real, s.view, axis, c, r + RAMP);
         float sum[LANES];
-        int axis = main_axis(s.view, c, r, 0);
 #if LANES == 8
+        const int axis = main_axis(s.view, c, r, 0);
         const float8 advance = axis ? d[1] : d[0];
         if (axis < 2 && all(sampled_across(axis, d) & (advance * advance.s0 > 0.0f)))
             store_lanes(trace_lanes(s, c, r, axis), sum);
@@ -185,9 +215,12 @@ kernel void forward_rays(
 #endif
             for (int lane = 0; lane < LANES; ++lane)
                 sum[lane] = trace(s, c, r + lane, main_axis(s.view, c, r + lane, 0));
-        const real x = fabs(d[0]), y = fabs(d[1]), z = fabs(d[2]);
+        const real x = fabs(d[0]);
+        const real y = fabs(d[1]);
+        const real z = fabs(d[2]);
         const real most = LARGER(LARGER(x, y), z);
-        store_lanes(load_lanes(sum) * voxel_size * sqrt(x * x + y * y + z * z) / most, sum);
+        const real length = voxel_size * sqrt(x * x + y * y + z * z) / most;
+        store_lanes(load_lanes(sum) * length, sum);
         for (int lane = 0; lane < min(LANES, rows - r); ++lane)
             line[r + lane] = from_plane > 0 ? line[r + lane] + sum[lane] : sum[lane];
     }
@@ -236,11 +269,21 @@ kernel void forward_columns(
     const float inverse = 1.0f / advance;
     const float slope_q = drift * inverse;
 
+    // planes where the column is within one voxel of the volume, one more against rounding
+    const int end_plane = min(to_plane, axis ? ny : nx) - 1;
+    float enter = from_plane - start_p;
+    float leave = end_plane - start_p;
+    keep_inside(start_q, slope_q, slope_q, across, &enter, &leave);
+    const int seen = enter <= leave;
+    if (!seen && from_plane > 0)
+        return;
+    const int first_plane = seen ? max((int)(enter + start_p), from_plane) : 0;
+    const int last_plane = seen ? min((int)(leave + start_p) + 1, end_plane) : -1;
+
     float sum[BLOCK];
     for (int k = 0; k < BLOCK; ++k)
         sum[k] = 0.0f;
-    const int end = min(to_plane, axis ? ny : nx) - 1;
-    for (int plane = from_plane; plane <= end; ++plane) {
+    for (int plane = first_plane; plane <= last_plane; ++plane) {
         const float q = fma(plane - start_p, slope_q, start_q);
         if (!(q > -1.0f && q < across))
             continue;

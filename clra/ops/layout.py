@@ -23,7 +23,7 @@ _PAD = 24  # as in geometry.clh
 
 # Projections that one launch treats. They have to stay in the last cache of a CPU, and few launches
 # have to read and write the volume.
-_CPU_BYTES = 16 << 20
+_CPU_BYTES = 24 << 20
 _GPU_BYTES = 256 << 20
 _LEAST_VIEWS = 8
 
@@ -79,6 +79,7 @@ class Layout:
         self.grid = grid
         self.lanes = lanes or (8 if cpu else 1)
         self.sizes = grid.shape[::-1]
+        self.volume_size = (grid.shape[0], grid.shape[2], grid.shape[1])
         self.panel = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
         self.last: list[cl.Event] = []
         self._views = geometry.views
