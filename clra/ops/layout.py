@@ -14,6 +14,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops import opencl
+from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import to_device
 from clra.ops.transpose import Planes, Transpose
 
@@ -45,6 +46,8 @@ class Layout:
         Form of the kernels, the one for the device by default; the other serves tests.
     tilted : bool
         Treat axial views as tilted ones; serves tests.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
     Attributes
     ----------
@@ -58,6 +61,8 @@ class Layout:
         nx, ny, nz.
     panel : tuple of int
         Columns, rows and elements of a padded line.
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
     last : list of cl.Event
         What the next call has to wait for, because it uses the same scratch.
     """
@@ -70,6 +75,7 @@ class Layout:
         volume_order: str,
         lanes: int | None = None,
         tilted: bool = False,
+        allocator: Allocator | None = None,
     ) -> None:
         if volume_order not in VOLUME_ORDERS:
             expected = " or ".join(map(repr, VOLUME_ORDERS))
@@ -92,6 +98,10 @@ class Layout:
         self._transpose = Transpose(context, self.lanes)
         self._lines: Array | None = None
         self._volume: Array | None = None
+        self._memory = Scratch(context, allocator)
+        self.scratch_bytes = 4 * min(geometry.views, self._most) * self._view_elements
+        if volume_order == "zyx":
+            self.scratch_bytes += 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
         self.set_geometry(geometry)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
@@ -117,19 +127,27 @@ class Layout:
         start, stop, step = (slice(None) if views is None else views).indices(self._views)
         if step != 1 or stop <= start:
             raise ValueError(f"views: found {views}, expected successive ones of {self._views}")
-        if queue.context != self.context:
-            raise ValueError("queue: its context is not the operator's")
+        opencl.check_queue(queue, self.context)
         columns, rows, _ = self.panel
         opencl.check_array(names[0], volume, self._volume_shape, context=self.context)
         shape = (stop - start, rows, columns)
         opencl.check_array(names[1], projections, shape, context=self.context)
         return start, stop
 
+    @property
+    def _view_elements(self) -> int:
+        """Elements of a view's padded lines."""
+        columns, _, pitch = self.panel
+        return (columns + 1) * pitch
+
+    @property
+    def _most(self) -> int:
+        """Views that one launch treats."""
+        return max(_LEAST_VIEWS, self._bytes // (4 * self._view_elements))
+
     def batches(self, count: int) -> Iterator[tuple[int, int]]:
         """Cut `count` views into runs that fit the scratch."""
-        columns, _, pitch = self.panel
-        most = max(_LEAST_VIEWS, self._bytes // (4 * (columns + 1) * pitch))
-        runs = -(-count // most)
+        runs = -(-count // self._most)
         for run in range(runs):
             yield count * run // runs, count * (run + 1) // runs
 
@@ -172,8 +190,9 @@ class Layout:
         """Lines of `count` views, (count, columns + 1, pitch)."""
         columns, _, pitch = self.panel
         if self._lines is None or len(self._lines) < count:
-            self._lines = Array(self.context, (count, columns + 1, pitch), np.float32)
-        return self._lines[:count]
+            self._lines = self._memory.empty((count, columns + 1, pitch))
+        lines: Array = self._lines[:count]
+        return lines
 
     def gather_volume(
         self, queue: cl.CommandQueue, volume: Array, wait_for: Sequence[cl.Event]
@@ -213,12 +232,12 @@ class Layout:
             return volume
         if self._volume is None:
             nx, ny, nz = self.sizes
-            self._volume = Array(self.context, (ny, nx, nz), np.float32)
+            self._volume = self._memory.empty((ny, nx, nz))
         return self._volume
 
 
 def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:
-    """What geometry.clh calls a view, (views, 24), composed in float64.
+    """Compose in float64 what geometry.clh calls a view, (views, 24).
 
     Raises
     ------

@@ -12,6 +12,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.layout import Layout
+from clra.ops.scratch import Allocator
 from clra.ops.steps import Step
 
 # What a work-item of a CPU makes: rows or voxels of a line, and the adjoint neighbouring columns.
@@ -46,6 +47,13 @@ class ForwardProjector:
         Of the volume.
     volume_order : {"zyx", "yxz"}
         Axes of the volume. "yxz" is the kernels' own order and takes no second volume.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
 
     Raises
     ------
@@ -65,10 +73,12 @@ class ForwardProjector:
         grid: VolumeGrid,
         *,
         volume_order: str = "zyx",
+        allocator: Allocator | None = None,
         _lanes: int | None = None,
         _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted)
+        self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted, allocator)
+        self.scratch_bytes = self._layout.scratch_bytes
         self._project = _Kernels(self._layout, "forwardproject.cl", "forward", "rays", _ROWS)
         nz, ny, nx = grid.shape
         planes = max(nz, ny, nx)
@@ -166,6 +176,13 @@ class BackProjector:
         Which of the two.
     volume_order : {"zyx", "yxz"}
         Axes of the volume. "yxz" is the kernels' own order and takes no second volume.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
 
     Raises
     ------
@@ -181,10 +198,12 @@ class BackProjector:
         *,
         matched: bool = False,
         volume_order: str = "zyx",
+        allocator: Allocator | None = None,
         _lanes: int | None = None,
         _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted)
+        self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted, allocator)
+        self.scratch_bytes = self._layout.scratch_bytes
         if matched:
             self._project = _Kernels(self._layout, "adjoint.cl", "adjoint", "voxels", _VOXELS)
             defines = {"LANES": self._layout.lanes}

@@ -132,7 +132,17 @@ CASES = {
         closeness=REGISTERED,
     ),
 }
-WITH_SCRATCH = ("ramp", "coverage", "warp", "band-pass", "phase correlation", "registration")
+WITH_SCRATCH = (
+    "forward",
+    "back",
+    "adjoint",
+    "ramp",
+    "coverage",
+    "warp",
+    "band-pass",
+    "phase correlation",
+    "registration",
+)
 
 
 @pytest.fixture(params=CASES)
