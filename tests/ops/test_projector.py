@@ -454,7 +454,7 @@ def test_another_context_is_refused(queue):
     operator = ForwardProjector(queue.context, geometry, GRID)
     out = cl_array.empty(queue, (geometry.views, *geometry.shape), np.float32)
     volume = on_device(queue, numbers(*GRID.shape))
-    with pytest.raises(ValueError, match="queue: its context .* is not the operator's"):
+    with pytest.raises(ValueError, match=r"queue: its context .* is not the operator's"):
         operator(foreign, out, volume)
     with pytest.raises(ValueError, match=r"volume: its context .* is not the operator's"):
         operator(queue, out, on_device(foreign, numbers(*GRID.shape)))
