@@ -36,10 +36,15 @@ def correct(scan: Scan, motion: Motion, device: Any = None) -> Scan:
     ValueError
         If the motion is of another number of views.
     """
+    return corrected(Stream(device), scan, motion)
+
+
+def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
+    """Do as :func:`correct`, on the device and within the memory of a stream."""
     if motion.views != scan.views:
         raise ValueError(f"motion: found {motion.views} views, expected {scan.views}")
     return Scan(
-        _Corrected(scan, motion, Stream(device)),
+        _Corrected(scan, motion, stream),
         scan.geometry,
         name=f"{scan.name}, corrected",
         mask=scan.mask,

@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment import align as align_scan
+from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
+from clra.methods.katsevich import exact_helices, katsevich
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.streaming import Radiographs, Report, Stream
 
-METHODS = ("fbp",)
+METHODS = ("fbp", "katsevich")
 
 
 def reconstruct(
@@ -33,13 +35,15 @@ def reconstruct(
     ----------
     scan : Scan
         Radiographs and their geometry.
-    method : {"fbp"}
-        Ramp-filtered back-projection, for any trajectory.
+    method : {"fbp", "katsevich"}
+        Ramp-filtered back-projection, for any trajectory; or Katsevich's, which is exact, for
+        helices and double helices.
     grid : VolumeGrid, optional
         Where to reconstruct; by default the whole field of view
         (:func:`clra.model.grid.default_grid`).
     motion : Motion, optional
-        Of the radiographs, absorbed into the geometry: nothing is resampled.
+        Of the radiographs. "fbp" absorbs it into the geometry, so that nothing is resampled;
+        "katsevich" needs ideal rows and resamples each radiograph once.
     align : bool
         Estimate the motion first, with the defaults of :func:`clra.align`.
     device : str or cl.Device, optional
@@ -57,12 +61,23 @@ def reconstruct(
     Raises
     ------
     ValueError
-        If the method is unknown, or both `motion` and `align` are given.
+        If the method is unknown, both `motion` and `align` are given, or the scan is one that
+        Katsevich's method cannot treat; says what pitch, panel or field of view would do.
     """
     if method not in METHODS:
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
+    stream = Stream(
+        device,
+        max_device_memory=max_device_memory,
+        max_host_memory=max_host_memory,
+        report=progress,
+    )
+    grid = grid or default_grid(scan.geometry)
+    if method == "katsevich" and align:
+        # What it cannot treat it refuses before the long work.
+        exact_helices(Radiographs(stream, scan, 1), scan.geometry, grid)
     if align:
         motion = align_scan(
             scan,
@@ -71,17 +86,8 @@ def reconstruct(
             max_device_memory=max_device_memory,
             max_host_memory=max_host_memory,
         ).motion
-    stream = Stream(
-        device,
-        max_device_memory=max_device_memory,
-        max_host_memory=max_host_memory,
-        report=progress,
-    )
+    if method == "katsevich":
+        ideal = scan if motion is None else corrected(stream, scan, motion)
+        return katsevich(stream, Radiographs(stream, ideal, 1), scan.geometry, grid).to_host()
     geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
-    volume = ramp_fbp(
-        stream,
-        Radiographs(stream, scan, 1),
-        geometry,
-        grid or default_grid(scan.geometry),
-    )
-    return volume.to_host()
+    return ramp_fbp(stream, Radiographs(stream, scan, 1), geometry, grid).to_host()

@@ -1,0 +1,172 @@
+"""Katsevich's exact reconstruction from one helix or several, streamed."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.model.helix import Helix
+from clra.model.helix_fit import fit_helices
+from clra.model.pi_intervals import field_of_view, pi_spans
+from clra.ops.katsevich import KatsevichFilter
+from clra.ops.pibackproject import PiBackProjector
+from clra.ops.streaming import Radiographs, Stream, Volume, runs, views_that_see
+
+# Views that are looked at for a sample wider than the field of view, and the part of the largest
+# line integral, as means over rows, that may be left at the field's border. Scatter and unevenness
+# of the open beam leave one or two per cent; a sample with less than 3 beyond suffers as little.
+_PROBED, _AT_BORDER = 24, 0.03
+
+
+def katsevich(
+    stream: Stream, radiographs: Radiographs, geometry: ConeBeamGeometry, grid: VolumeGrid
+) -> Volume:
+    """Reconstruct exactly from helical radiographs.
+
+    Katsevich's inversion [1]_ for flat panels, by the five steps of [2]_. Several helices that
+    follow each other, such as a double helix, are reconstructed each by itself and averaged where
+    more than one of them holds all views of a voxel that the formula needs. Voxels of which no
+    helix does, at the ends of the scan and outside the circle that all views see, are 0.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    radiographs : Radiographs
+        Line integrals at the resolution of `geometry`, free of motion.
+    geometry : ConeBeamGeometry
+        Of those radiographs: helices about z, upright panels that face the axis. Start, sense and
+        pitch are free, and so is where on the panel the axis is seen.
+    grid : VolumeGrid
+        Where to reconstruct.
+
+    Returns
+    -------
+    Volume
+        Attenuation [1/mm].
+
+    Raises
+    ------
+    ValueError
+        If the trajectory is no helix, the panel shorter than the Tam-Danielsson window, the sample
+        wider than the field of view, or the helix too short for any of the grid; the message says
+        what would do.
+
+    References
+    ----------
+    .. [1] A. Katsevich, "Theoretically exact filtered backprojection-type inversion algorithm for
+       spiral CT", SIAM J. Appl. Math. 62, 2012 (2002).
+    .. [2] F. Noo, J. Pack, D. Heuscher, "Exact helical reconstruction using native cone-beam
+       geometries", Phys. Med. Biol. 48, 3787 (2003).
+    """
+    fitted, radius = exact_helices(radiographs, geometry, grid)
+    # Steps 1 to 4: derivative, to kappa lines, Hilbert transform, back to rows.
+    filters = [KatsevichFilter(stream.context, helix, radius) for _, helix in fitted]
+    helices = [one.helix for one in filters]
+    volume = Volume(stream, grid)
+    seeing = [
+        [views_that_see(helix.geometry(), slab) for helix in helices] for slab in volume.slabs
+    ]
+    total, done = sum(int(chosen.sum()) for slab in seeing for chosen in slab), 0
+    for index, slab in enumerate(volume.slabs):
+        nz, ny, nx = slab.shape
+        attenuation = stream.empty((ny, nx, nz))
+        attenuation.fill(np.float32(0), queue=stream.queue)
+        for number, (all_views, _) in enumerate(fitted):
+            # Step 5: back-projection over pi-intervals.
+            back = PiBackProjector(stream.context, helices, number, slab, radius)
+            busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
+            for run in runs(seeing[index][number]):
+                for chunk in stream.chunks(run.stop - run.start, radiographs.view_bytes):
+                    views = slice(run.start + chunk.start, run.start + chunk.stop)
+                    stream.report("back-projecting", done, total)
+                    first = all_views.start + views.start
+                    count = views.stop - views.start
+                    # The filter makes one view from two.
+                    measured = stream.upload(radiographs.read(slice(first, first + count + 1)))
+                    filtered = stream.empty((count, *helices[number].shape))
+                    ready = filters[number](stream.queue, filtered, measured)
+                    event = back(stream.queue, attenuation, filtered, views=views, wait_for=[ready])
+                    # At most two chunks in flight bound the memory, and none may be let go before.
+                    busy.append((event, (measured, filtered)))
+                    if len(busy) > 2:
+                        busy.pop(0)[0].wait()
+                    done += count
+            stream.queue.finish()
+        volume.put(index, attenuation)
+    stream.report("back-projecting", total, total)
+    return volume
+
+
+def exact_helices(
+    radiographs: Radiographs, geometry: ConeBeamGeometry, grid: VolumeGrid
+) -> tuple[list[tuple[slice, Helix]], float]:
+    """Find the helices of a scan, and refuse what :func:`katsevich` cannot treat.
+
+    Parameters
+    ----------
+    radiographs, geometry, grid
+        As :func:`katsevich` takes them. A few radiographs are read.
+
+    Returns
+    -------
+    helices : list of (slice, Helix)
+        Views of each helix, and the helix.
+    radius : float
+        Of the field of view about the axis [mm].
+
+    Raises
+    ------
+    ValueError
+        As :func:`katsevich` does.
+    """
+    fitted = fit_helices(geometry)
+    radius = field_of_view([helix for _, helix in fitted], grid)
+    _refuse_short([helix.between() for _, helix in fitted], grid, radius)
+    for views, helix in fitted:
+        _refuse_wide_sample(radiographs, views, helix, radius)
+    return fitted, radius
+
+
+def _refuse_short(helices: list[Helix], grid: VolumeGrid, radius: float) -> None:
+    """Raise where no plane of the grid has a voxel whose pi-interval is on a helix."""
+    plane = grid.slab(0, 1)
+    planes = grid.shape[0]
+    for helix in helices:
+        low, high = np.moveaxis(pi_spans(helix, plane, radius), 2, 0)
+        if ((np.maximum(low, 0) < np.minimum(high, planes - 1)) & np.isfinite(low)).any():
+            return
+    z = [end for helix in helices for end in (helix.z, helix.z + helix.views * helix.z_step)]
+    raise ValueError(
+        f"grid: found heights {grid.coordinates()[2][0]:.4g} to {grid.coordinates()[2][-1]:.4g} mm "
+        f"of which the helix, {min(z):.4g} to {max(z):.4g} mm, holds no pi-interval, expected more "
+        "turns, a smaller pitch or another grid"
+    )
+
+
+def _refuse_wide_sample(
+    radiographs: Radiographs, views: slice, helix: Helix, radius: float
+) -> None:
+    """Raise where a sample reaches beyond the field of view, as far as radiographs show it."""
+    border = math.tan(helix.fan(radius))
+    tangent = helix.tangent_u(np.arange(helix.shape[1]))
+    rows = slice(*helix.window_rows(radius))
+    chosen = np.unique(np.linspace(views.start, views.stop - 1, _PROBED).astype(int))
+    profiles = np.stack(
+        [radiographs.read(slice(view, view + 1))[0, rows].mean(axis=0) for view in chosen]
+    )
+    inside = np.flatnonzero(np.abs(tangent) <= border)
+    borders = profiles[:, inside[[0, -1]]].max(axis=1)
+    worst = int(borders.argmax())
+    cut, most = borders[worst], profiles[worst, inside].max()
+    if cut > _AT_BORDER * profiles[:, inside].max():
+        # As wide as a round sample on the axis with the same line integrals would be.
+        width = 2 * radius / math.sqrt(max(1 - (cut / most) ** 2, 1e-2))
+        raise ValueError(
+            f"radiographs: the sample reaches beyond the field of view of {2 * radius:.4g} mm "
+            f"(line integrals of {cut:.3g} at its border, {most:.3g} inside), expected a field of "
+            f"view of about {width:.4g} mm or a smaller sample; or use method 'fbp'"
+        )
