@@ -80,7 +80,8 @@ static inline real elements(global const float *line, const int rows, const real
 }
 
 // What the rays of a view that are sampled across axis p give LANES voxels (x, y, z) along z.
-static inline real gather(
+// Inlined by force: as a function of any axis it keeps its vectors in memory.
+__attribute__((always_inline)) static inline real gather(
     global const float *m, // the view
     global const float *image, // (columns + 1, pitch), padded
     const real voxel[3],
