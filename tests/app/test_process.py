@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-CLRA = (sys.executable, "-m", "clra.app.cli")
+CLRA = (sys.executable, "-P", "-m", "clra.app.cli")
 
 
 def run(*arguments, **options):
@@ -24,7 +24,7 @@ def test_devices_are_listed_quickly_and_nothing_heavy_is_imported():
         "heavy = {'matplotlib', 'scipy', 'h5py', 'rich', 'nxtomo', 'reikna'} & set(sys.modules); "
         "sys.exit(', '.join(sorted(heavy)) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     started = time.perf_counter()
     code, out, err = run("devices")

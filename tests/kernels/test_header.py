@@ -15,7 +15,8 @@ FILES = clra.kernels.names()
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "clra.kernels", *map(str, arguments)]
+    # -P: the installed package, not the checkout that the tests may be run in
+    command = [sys.executable, "-P", "-W", "error", "-m", "clra.kernels", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
