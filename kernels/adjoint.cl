@@ -115,7 +115,7 @@ __attribute__((always_inline)) static inline real gather(
     if (SMALLER(FIRST(top), LAST(top)) > rows || LARGER(FIRST(bottom), LAST(bottom)) < -1.0f)
         return 0.0f;
     top = ceil(clamp(top - SLACK, (real)(0.0f), (real)(rows)));
-    const int tries = (int)(highest_lane(bottom - top) + SLACK) + 1;
+    const int tries = (int)(highest_lane(SMALLER(bottom, (real)(rows)) - top) + SLACK) + 1;
     real sum = 0.0f;
     for (int c = first; c <= last; ++c) {
         real row = top;
@@ -331,8 +331,9 @@ kernel void adjoint_columns(
         }
     }
     for (int i = 0; i < width; ++i) {
-        const size_t column = axis ? (size_t)plane * nx + side + i : (size_t)(side + i) * nx + plane;
-        put(volume + column * nz + z, sum + (i + 1) * BLOCK, voxels, accumulate);
+        const size_t x = axis ? side + i : plane;
+        const size_t y = axis ? plane : side + i;
+        put(volume + (y * nx + x) * nz + z, sum + (i + 1) * BLOCK, voxels, accumulate);
     }
 }
 #endif

@@ -7,14 +7,22 @@
 // linear in z. So two adjacent detector columns are blended once and the blend is resampled.
 //
 // A work-item sums BLOCK voxels along z over the given views. Global sizes are (blocks, nx, ny), of
-// backproject_columns (blocks, STRIP, ny ceil(nx / STRIP)), rounded up at will. Every voxel has to be
-// in front of every source (g > 0).
+// backproject_columns (blocks, STRIP, ny ceil(nx / STRIP)), rounded up at will. Every voxel has to
+// be in front of every source (g > 0).
 
 #include "geometry.clh"
 
 #ifndef BLOCK
-#define BLOCK (LANES == 1 ? 1 : 32 * LANES) // whole LANES
+#define BLOCK (LANES == 1 ? 1 : 32 * LANES) // a multiple of LANES LANES
 #endif
+
+// How a run of LANES voxels lies in an image.
+#define RUNS (BLOCK / LANES)
+#define OFF 0
+#define TWO 1 // between two columns
+#define THREE 2 // among three
+#define ODD 4 // neither, or too far along the rows
+#define PARTLY 8 // some voxels off the panel
 
 // Columns along x that backproject_columns treats for all y before it goes on: so what they see of
 // the projections stays in the cache. Half or twice as many change nothing; all of 448 halve the
@@ -67,36 +75,64 @@ kernel void backproject_voxels(
         const float a = fma(m[0], (float)x, fma(m[1], (float)y, m[3]));
         const float b = fma(m[4], (float)x, fma(m[5], (float)y, m[7]));
         const float g = fma(m[8], (float)x, fma(m[9], (float)y, m[11]));
-        for (int k = 0; k < voxels; k += LANES) {
-            const real height = (float)(z + k) + RAMP;
+        // Where in the image each run of LANES voxels lies, for LANES runs at a time: known ahead,
+        // it keeps no load waiting for a division.
+        int firsts[RUNS], bases[RUNS], kinds[RUNS];
+        for (int run = 0; run * LANES < voxels; run += LANES) {
+            const real begin = z + LANES * (run + RAMP);
+            const real end = begin + (LANES - 1.0f);
+            const real begin_scale = 1.0f / (m[10] * begin + g);
+            const real end_scale = 1.0f / (m[10] * end + g);
+            const real begin_column = (m[2] * begin + a) * begin_scale;
+            const real end_column = (m[2] * end + a) * end_scale;
+            const real begin_row = (m[6] * begin + b) * begin_scale;
+            const real end_row = (m[6] * end + b) * end_scale;
+            // Both are monotonic in z: the ends bound what lies between.
+            const real left = SMALLER(begin_column, end_column);
+            const real right = LARGER(begin_column, end_column);
+            const real top = SMALLER(begin_row, end_row);
+            const real bottom = LARGER(begin_row, end_row);
+            const whole first = to_whole(LARGER(left, (real)(0.0f)));
+            const whole last = to_whole(SMALLER(right, (real)(last_column))) + 1;
+            const whole base = to_whole(LARGER(top, (real)(1.0f - PAD)) + PAD) - PAD;
+            whole kind = last > first + 1 ? (whole)(THREE) : (whole)(TWO);
+            kind = ((bottom - top > SPAN - 1.0f) | (last > first + 2)) ? (whole)(ODD) : kind;
+            const whole within =
+                (left >= 0.0f) & (right <= last_column) & (top >= 0.0f) & (bottom <= last_row);
+            const whole touching =
+                (right >= 0.0f) & (left <= last_column) & (bottom >= 0.0f) & (top <= last_row);
+            kind = within ? kind : kind | PARTLY;
+            kind = touching ? kind : (whole)(OFF);
+            store_lanes(first, firsts + run);
+            store_lanes(base, bases + run);
+            store_lanes(kind, kinds + run);
+        }
+        for (int run = 0; run * LANES < voxels; ++run) {
+            const int kind = kinds[run];
+            if (kind == OFF)
+                continue;
+            const real height = (float)(z + run * LANES) + RAMP;
             const real scale = 1.0f / (m[10] * height + g);
             const real column = (m[2] * height + a) * scale;
             const real row = (m[6] * height + b) * scale;
-            // Both are monotonic in z: the ends bound what lies between.
-            const float left = SMALLER(FIRST(column), LAST(column));
-            const float right = LARGER(FIRST(column), LAST(column));
-            const float top = SMALLER(FIRST(row), LAST(row));
-            const float bottom = LARGER(FIRST(row), LAST(row));
-            if (right < 0.0f || left > last_column || bottom < 0.0f || top > last_row)
-                continue;
-            const int first = (int)LARGER(left, 0.0f);
-            const int last = (int)SMALLER(right, last_column) + 1;
-            global const float *line = image + (size_t)first * pitch;
-            real value;
-            if (bottom - top <= SPAN - 1.0f && last <= first + 2) {
-                const int base = below(top);
-                value = among(line + base, pitch, column - (float)first, row - (float)base, last == first + 2);
+            global const float *line = image + (size_t)firsts[run] * pitch;
+            const real across = column - (float)firsts[run];
+            real value = 0.0f;
+            if (kind & ODD) {
+                const int lines = (int)LARGER(FIRST(across), LAST(across)) + 2;
+                for (int i = 0; i < min(lines, columns - firsts[run]); ++i)
+                    value += hat(across - (float)i) * taps(line + i * pitch, rows, row);
             } else {
-                value = 0.0f;
-                for (int c = first; c <= last; ++c, line += pitch)
-                    value += hat(column - (float)c) * taps(line, rows, row);
+                value = among(
+                    line + bases[run], pitch, across, row - (float)bases[run], kind & THREE);
             }
             value *= scale * scale;
-            if (left < 0.0f || right > last_column || top < 0.0f || bottom > last_row)
-                value = WHERE((column >= 0.0f) & (column <= last_column) & (row >= 0.0f) &
-                                  (row <= last_row),
-                              value);
-            store_lanes(load_lanes(sum + k) + value, sum + k);
+            if (kind & PARTLY)
+                value = WHERE(
+                    (column >= 0.0f) & (column <= last_column) & (row >= 0.0f) & (row <= last_row),
+                    value);
+            float *target = sum + run * LANES;
+            store_lanes(load_lanes(target) + value, target);
         }
     }
     put(volume + ((size_t)y * nx + x) * nz + z, sum, voxels, accumulate);

@@ -8,10 +8,10 @@
 // their heights there are linear in the row. So two adjacent voxel columns are blended once and the
 // blend is resampled.
 //
-// A work-item makes BLOCK rows of one column. It sums over the planes from_plane to to_plane - 1 and
-// adds to what projections hold if from_plane > 0, so that the host can take the volume in parts
-// that stay in the cache for all views. Global sizes are (blocks, columns, count), rounded up at
-// will. Every voxel, and the one beyond, has to be in front of every source.
+// A work-item makes BLOCK rows of one column. It sums over the planes from_plane to to_plane - 1
+// and adds to what projections hold if from_plane > 0, so that the host can take the volume in
+// parts that stay in the cache for all views. Global sizes are (blocks, columns, count), rounded up
+// at will. Every voxel, and the one beyond, has to be in front of every source.
 
 #include "geometry.clh"
 
@@ -154,11 +154,10 @@ static inline float8 trace_lanes(const scene s, const float c, const float r, co
         const int high = below(t * right_slope + start_q) + 1;
         const int base = below(t * low_slope + start_z);
         global const float *line = s.volume + plane * stride(s, p);
-        if (low >= 0 && high <= most && high <= low + 2 && base >= 0 &&
-            base <= s.nz - WINDOW && t * (high_slope - low_slope) <= SPAN - 1.0f) {
+        if (low >= 0 && high <= most && high <= low + 2 && base >= 0 && base <= s.nz - WINDOW &&
+            t * (high_slope - low_slope) <= SPAN - 1.0f) {
             line += low * stride_q + base;
-            sum += among(
-                line, stride_q, at_q - (float)low, at_z - (float)base, high == low + 2);
+            sum += among(line, stride_q, at_q - (float)low, at_z - (float)base, high == low + 2);
         } else {
             for (int i = max(low, 0); i <= min(high, most); ++i)
                 sum += hat(at_q - (float)i) * taps(line + i * stride_q, s.nz, at_z);

@@ -85,7 +85,6 @@ class Layout:
         self.grid = grid
         self.lanes = lanes or (8 if cpu else 1)
         self.sizes = grid.shape[::-1]
-        self.volume_size = (grid.shape[0], grid.shape[2], grid.shape[1])
         self.panel = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
         self.last: list[cl.Event] = []
         self._views = geometry.views

@@ -11,15 +11,16 @@ from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.ops.blocks import Blocks
 from clra.ops.layout import Layout
 from clra.ops.scratch import Allocator
 from clra.ops.steps import Step
 
-# What a work-item of a CPU makes: rows or voxels of a line, and the adjoint neighbouring columns.
-# Half as many cost a quarter of the speed, more do not fit its first cache.
-_ROWS = 384
-_VOXELS = 256
-_WIDTH = 16
+# The most that a work-item of a CPU makes: rows or voxels of a line, and for the adjoint columns
+# beside each other, whose sums have to fit the first cache. Of 448 voxels, blocks of 256 cost a
+# sixth of the speed, of 128 a third.
+_LINE = 1024
+_ADJOINT_LINE, _WIDTH = 512, 16
 # Columns of voxels that a CPU back-projects for all y before it goes on, see backproject.cl.
 _STRIP = 32
 
@@ -79,7 +80,8 @@ class ForwardProjector:
     ) -> None:
         self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted, allocator)
         self.scratch_bytes = self._layout.scratch_bytes
-        self._project = _Kernels(self._layout, "forwardproject.cl", "forward", "rays", _ROWS)
+        kernels = ("forwardproject.cl", "forward_columns", "forward_rays")
+        self._project = Blocks(self._layout, *kernels, geometry.rows, _LINE)
         nz, ny, nx = grid.shape
         planes = max(nz, ny, nx)
         thick = planes
@@ -137,7 +139,7 @@ class ForwardProjector:
             for planes in self._parts:
                 event = self._project(
                     queue,
-                    (layout.panel[1], layout.panel[0], last - first),
+                    (layout.panel[0], last - first),
                     lines,
                     columns,
                     slice(start + first, start + last),
@@ -204,13 +206,16 @@ class BackProjector:
     ) -> None:
         self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted, allocator)
         self.scratch_bytes = self._layout.scratch_bytes
+        nz = grid.shape[0]
         if matched:
-            self._project = _Kernels(self._layout, "adjoint.cl", "adjoint", "voxels", _VOXELS)
-            defines = {"LANES": self._layout.lanes}
-            self._weigh = Step(context, "adjoint.cl", "weigh_rays", (64, 1, 1), defines)
+            kernels = ("adjoint.cl", "adjoint_columns", "adjoint_voxels")
+            width = {"WIDTH": _WIDTH}
+            self._project = Blocks(self._layout, *kernels, nz, _ADJOINT_LINE, width)
+            lanes = {"LANES": self._layout.lanes}
+            self._weigh = Step(context, "adjoint.cl", "weigh_rays", (64, 1, 1), lanes)
         else:
-            file, action = "backproject.cl", "backproject"
-            self._project = _Kernels(self._layout, file, action, "voxels", _VOXELS)
+            kernels = ("backproject.cl", "backproject_columns", "backproject_voxels")
+            self._project = Blocks(self._layout, *kernels, nz, _LINE, {"STRIP": _STRIP})
         self._matched = matched
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
@@ -276,12 +281,10 @@ class BackProjector:
             layout.last = [event]
         return event
 
-    def _size(self) -> tuple[int, int, int]:
-        """Global size, before blocks."""
-        nz, nx, ny = self._layout.volume_size
-        if self._layout.columnar:
-            return nz, _STRIP, ny * -(-nx // _STRIP)
-        return nz, nx, ny
+    def _size(self) -> tuple[int, int]:
+        """Global size across the columns."""
+        nx, ny, _ = self._layout.sizes
+        return (_STRIP, ny * -(-nx // _STRIP)) if self._layout.columnar else (nx, ny)
 
     def _adjoint(
         self,
@@ -305,52 +308,11 @@ class BackProjector:
             layout.grid.voxel_size,
             wait_for=[event],
         )
-        nz, nx, ny = layout.volume_size
+        nx, ny, _ = layout.sizes
         if not layout.columnar:
-            return self._project(queue, (nz, nx, ny), columns, lines, views, adds, wait_for=[event])
-        for axis, size in enumerate([(nz, nx, -(-ny // _WIDTH)), (nz, ny, -(-nx // _WIDTH))]):
+            return self._project(queue, (nx, ny), columns, lines, views, adds, wait_for=[event])
+        for axis, size in enumerate([(nx, -(-ny // _WIDTH)), (ny, -(-nx // _WIDTH))]):
             event = self._project(
                 queue, size, columns, lines, views, axis, max(adds, axis), wait_for=[event]
             )
         return event
-
-
-class _Kernels:
-    """The kernel for columns and the general one of one operation."""
-
-    def __init__(self, layout: Layout, file: str, action: str, general: str, block: int) -> None:
-        self._layout = layout
-        self._block = block if layout.lanes > 1 else 1
-        defines = {"LANES": layout.lanes, "BLOCK": self._block, "WIDTH": _WIDTH, "STRIP": _STRIP}
-        # On GPUs neighbours along a line read neighbours, and next columns share what they read.
-        local = (1, 1, 1) if layout.lanes > 1 else (32, 8, 1)
-        names = ("columns", general) if layout.lanes > 1 else (general, general)
-        self._steps = [
-            Step(layout.context, file, f"{action}_{name}", local, defines) for name in names
-        ]
-
-    def __call__(
-        self,
-        queue: cl.CommandQueue,
-        shape: tuple[int, ...],
-        target: Array,
-        source: Array,
-        views: slice,
-        *more: float,
-        wait_for: Sequence[cl.Event],
-    ) -> cl.Event:
-        """Launch over `shape`, the first axis in blocks."""
-        layout = self._layout
-        step = self._steps[0] if layout.columnar else self._steps[1]
-        return step(
-            queue,
-            (-(-shape[0] // self._block), *shape[1:]),
-            target,
-            source,
-            layout.table[views],
-            *layout.sizes,
-            *layout.panel,
-            views.stop - views.start,
-            *more,
-            wait_for=wait_for,
-        )
