@@ -24,8 +24,6 @@ def ramp_fbp(
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
     *,
-    fade: float = FADE,
-    window: str = "ram-lak",
     stage: str = "back-projecting",
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
@@ -45,10 +43,6 @@ def ramp_fbp(
         Of those radiographs, with the motion absorbed.
     grid : VolumeGrid
         Where to reconstruct.
-    fade : float
-        Part of the rows at each end over which a view's weight falls to nothing.
-    window : str
-        Apodisation of the ramp.
     stage : str
         What progress reports call this.
 
@@ -63,8 +57,8 @@ def ramp_fbp(
        Am. A 1, 612 (1984).
     """
     context, queue = stream.context, stream.queue
-    row_weight = taper(geometry.rows, fade)
-    ramp = RampFilter(context, geometry, row_weight=row_weight, window=window)
+    row_weight = taper(geometry.rows, FADE)
+    ramp = RampFilter(context, geometry, row_weight=row_weight)
     coverage = Coverage(context, geometry, grid, row_weight)
     coverage.compute(queue)
     volume = Volume(stream, grid)
