@@ -11,7 +11,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.projector import ForwardProjector
+from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
 
 if TYPE_CHECKING:
@@ -222,13 +222,9 @@ def _views_worth_showing(motion: Motion, confidence: NDArray[np.float64]) -> dic
 
 
 def _reprojected(stream: Stream, volume: Volume, geometry: ConeBeamGeometry) -> Image:
-    total = np.zeros((geometry.views, *geometry.shape), np.float32)
-    images = stream.empty(total.shape)
-    for index, slab in enumerate(volume.slabs):
-        project = ForwardProjector(stream.context, geometry, slab, volume_order="yxz")
-        project(stream.queue, images, volume.get(index)).wait()
-        total += stream.download(images)
-    return total
+    images = stream.empty((geometry.views, *geometry.shape))
+    SlabProjector(stream, volume, geometry)(images, slice(0, geometry.views))
+    return stream.download(images)
 
 
 def _fitted(simulated: Image, measured: Image) -> Image:

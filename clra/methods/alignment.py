@@ -224,6 +224,9 @@ class _Run:
             mask=None if self.scan.mask is None else _binned_mask(self.scan.mask, level),
             magnification=self.scale,
             spread=_SPREAD,
+            allocator=stream.memory,
+            # It keeps a pair's images in a dozen forms; the filters' share is free by now.
+            scratch_limit=3 * stream.scratch_limit,
         )
         # 3, 4: simulate and register
         return reproject_and_register(

@@ -11,7 +11,14 @@ from clra.ops.streaming import Stream
 from clra.ops.warp import Warp
 
 
-def correct(scan: Scan, motion: Motion, device: Any = None) -> Scan:
+def correct(
+    scan: Scan,
+    motion: Motion,
+    device: Any = None,
+    *,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
+) -> Scan:
     """Undo the motion of each radiograph by resampling it.
 
     Every radiograph is interpolated once, from the measured pixels, by cubic B-splines. Methods
@@ -25,6 +32,8 @@ def correct(scan: Scan, motion: Motion, device: Any = None) -> Scan:
         Of its views, as :func:`clra.align` found it.
     device : str or cl.Device, optional
         As :func:`clra.ops.opencl.choose_device` takes it.
+    max_device_memory, max_host_memory : int, optional
+        Bytes that may be used.
 
     Returns
     -------
@@ -36,7 +45,8 @@ def correct(scan: Scan, motion: Motion, device: Any = None) -> Scan:
     ValueError
         If the motion is of another number of views.
     """
-    return corrected(Stream(device), scan, motion)
+    stream = Stream(device, max_device_memory=max_device_memory, max_host_memory=max_host_memory)
+    return corrected(stream, scan, motion)
 
 
 def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
@@ -58,7 +68,12 @@ class _Corrected:
         self.shape = scan.shape
         self._scan = scan
         self._stream = stream
-        self._warp = Warp(stream.context, scan.geometry.shape)
+        self._warp = Warp(
+            stream.context,
+            scan.geometry.shape,
+            allocator=stream.memory,
+            scratch_limit=stream.scratch_limit,
+        )
         self._motion = np.stack(
             [motion.shift_u, motion.shift_v, motion.magnification], axis=1
         ).astype(np.float32)

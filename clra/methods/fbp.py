@@ -8,10 +8,11 @@ import pyopencl as cl
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.model.visibility import runs, views_that_see
 from clra.ops.coverage import Coverage
 from clra.ops.filtering import RampFilter, taper
 from clra.ops.projector import BackProjector
-from clra.ops.streaming import Radiographs, Stream, Volume, runs, views_that_see
+from clra.ops.streaming import PlaneWriter, Radiographs, Stream, Volume
 
 # Part of the rows at the top and at the bottom over which a view fades out. Without it the border
 # of each panel leaves an edge in the volume; a tenth smooths it and costs few rays.
@@ -25,6 +26,7 @@ def ramp_fbp(
     grid: VolumeGrid,
     *,
     stage: str = "back-projecting",
+    target: PlaneWriter | None = None,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
 
@@ -45,11 +47,13 @@ def ramp_fbp(
         Where to reconstruct.
     stage : str
         What progress reports call this.
+    target : PlaneWriter, optional
+        Takes the planes of each slab as soon as it is done; the volume is then not kept.
 
     Returns
     -------
     Volume
-        Attenuation [1/mm].
+        Attenuation [1/mm]; without its slabs if they went to `target`.
 
     References
     ----------
@@ -58,8 +62,9 @@ def ramp_fbp(
     """
     context, queue = stream.context, stream.queue
     row_weight = taper(geometry.rows, FADE)
-    ramp = RampFilter(context, geometry, row_weight=row_weight)
-    coverage = Coverage(context, geometry, grid, row_weight)
+    memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
+    ramp = RampFilter(context, geometry, row_weight=row_weight, **memory)
+    coverage = Coverage(context, geometry, grid, row_weight, allocator=stream.memory)
     coverage.compute(queue)
     volume = Volume(stream, grid)
     slabs = volume.slabs
@@ -69,7 +74,7 @@ def ramp_fbp(
         nz, ny, nx = slab.shape
         attenuation = stream.empty((ny, nx, nz))
         attenuation.fill(np.float32(0), queue=queue)
-        back = BackProjector(context, geometry, slab, volume_order="yxz")
+        back = BackProjector(context, geometry, slab, volume_order="yxz", **memory)
         busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
         for run in runs(seeing[index]):
             for chunk in stream.chunks(run.stop - run.start, radiographs.view_bytes):
@@ -81,14 +86,18 @@ def ramp_fbp(
                 event = back(
                     queue, attenuation, filtered, views=views, accumulate=True, wait_for=[ready]
                 )
-                # At most two chunks in flight bound the memory, and none may be let go before.
+                # One chunk is read while another is worked on; none may be let go before.
                 busy.append((event, (measured, filtered)))
-                if len(busy) > 2:
+                if len(busy) > 1:
                     busy.pop(0)[0].wait()
+                del measured, filtered
                 done += views.stop - views.start
         first = volume.planes[index].start
         coverage.normalise(queue, attenuation, math.pi, first=first, volume_order="yxz")
-        volume.put(index, attenuation)
+        if target is None:
+            volume.put(index, attenuation)
+        else:
+            volume.write_slab(index, attenuation, target)
         queue.finish()
     stream.report(stage, total, total)
     return volume

@@ -11,9 +11,10 @@ from clra.model.grid import VolumeGrid
 from clra.model.helix import Helix
 from clra.model.helix_fit import fit_helices
 from clra.model.pi_intervals import field_of_view, pi_spans
+from clra.model.visibility import runs, views_that_see
 from clra.ops.katsevich import KatsevichFilter
 from clra.ops.pibackproject import PiBackProjector
-from clra.ops.streaming import Radiographs, Stream, Volume, runs, views_that_see
+from clra.ops.streaming import PlaneWriter, Radiographs, Stream, Volume
 
 # Views that are looked at for a sample wider than the field of view, and the part of the largest
 # line integral, as means over rows, that may be left at the field's border. Scatter and unevenness
@@ -22,7 +23,12 @@ _PROBED, _AT_BORDER = 24, 0.03
 
 
 def katsevich(
-    stream: Stream, radiographs: Radiographs, geometry: ConeBeamGeometry, grid: VolumeGrid
+    stream: Stream,
+    radiographs: Radiographs,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    *,
+    target: PlaneWriter | None = None,
 ) -> Volume:
     """Reconstruct exactly from helical radiographs.
 
@@ -42,11 +48,13 @@ def katsevich(
         pitch are free, and so is where on the panel the axis is seen.
     grid : VolumeGrid
         Where to reconstruct.
+    target : PlaneWriter, optional
+        Takes the planes of each slab as soon as it is done; the volume is then not kept.
 
     Returns
     -------
     Volume
-        Attenuation [1/mm].
+        Attenuation [1/mm]; without its slabs if they went to `target`.
 
     Raises
     ------
@@ -64,7 +72,8 @@ def katsevich(
     """
     fitted, radius = exact_helices(radiographs, geometry, grid)
     # Steps 1 to 4: derivative, to kappa lines, Hilbert transform, back to rows.
-    filters = [KatsevichFilter(stream.context, helix, radius) for _, helix in fitted]
+    memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
+    filters = [KatsevichFilter(stream.context, helix, radius, **memory) for _, helix in fitted]
     helices = [one.helix for one in filters]
     volume = Volume(stream, grid)
     seeing = [
@@ -77,7 +86,7 @@ def katsevich(
         attenuation.fill(np.float32(0), queue=stream.queue)
         for number, (all_views, _) in enumerate(fitted):
             # Step 5: back-projection over pi-intervals.
-            back = PiBackProjector(stream.context, helices, number, slab, radius)
+            back = PiBackProjector(stream.context, helices, number, slab, radius, **memory)
             busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
             for run in runs(seeing[index][number]):
                 for chunk in stream.chunks(run.stop - run.start, radiographs.view_bytes):
@@ -90,13 +99,18 @@ def katsevich(
                     filtered = stream.empty((count, *helices[number].shape))
                     ready = filters[number](stream.queue, filtered, measured)
                     event = back(stream.queue, attenuation, filtered, views=views, wait_for=[ready])
-                    # At most two chunks in flight bound the memory, and none may be let go before.
+                    # One chunk is read and copied while another is worked on; none may be let go
+                    # before.
                     busy.append((event, (measured, filtered)))
-                    if len(busy) > 2:
+                    if len(busy) > 1:
                         busy.pop(0)[0].wait()
+                    del measured, filtered
                     done += count
             stream.queue.finish()
-        volume.put(index, attenuation)
+        if target is None:
+            volume.put(index, attenuation)
+        else:
+            volume.write_slab(index, attenuation, target)
     stream.report("back-projecting", total, total)
     return volume
 

@@ -12,7 +12,7 @@ from clra.methods.katsevich import exact_helices, katsevich
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming import Radiographs, Report, Stream
+from clra.ops.streaming import HostPlanes, PlaneWriter, Radiographs, Report, Stream
 
 METHODS = ("fbp", "katsevich")
 
@@ -51,7 +51,8 @@ def reconstruct(
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
-        Bytes that may be used.
+        Bytes that may be used, see :class:`clra.ops.streaming.Stream`. The volume that is returned
+        comes on top: :func:`reconstruct_into` takes one larger than the memory.
 
     Returns
     -------
@@ -63,6 +64,50 @@ def reconstruct(
     ValueError
         If the method is unknown, both `motion` and `align` are given, or the scan is one that
         Katsevich's method cannot treat; says what pitch, panel or field of view would do.
+    """
+    planes = HostPlanes(grid or default_grid(scan.geometry))
+    reconstruct_into(
+        planes,
+        scan,
+        method,
+        planes.grid,
+        motion,
+        align,
+        device,
+        progress=progress,
+        max_device_memory=max_device_memory,
+        max_host_memory=max_host_memory,
+    )
+    return planes.volume
+
+
+def reconstruct_into(
+    target: PlaneWriter,
+    scan: Scan,
+    method: str = "fbp",
+    grid: VolumeGrid | None = None,
+    motion: Motion | None = None,
+    align: bool = False,
+    device: Any = None,
+    *,
+    progress: Report | None = None,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
+) -> None:
+    """Reconstruct a volume, and hand it on some planes at a time.
+
+    Parameters
+    ----------
+    target : PlaneWriter
+        Takes the planes, each once; :func:`clra.io.volumes.open_volume` gives one that writes a
+        file.
+    scan, method, grid, motion, align, device, progress, max_device_memory, max_host_memory
+        As :func:`reconstruct` takes them.
+
+    Raises
+    ------
+    ValueError
+        As :func:`reconstruct` does.
     """
     if method not in METHODS:
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
@@ -88,6 +133,7 @@ def reconstruct(
         ).motion
     if method == "katsevich":
         ideal = scan if motion is None else corrected(stream, scan, motion)
-        return katsevich(stream, Radiographs(stream, ideal, 1), scan.geometry, grid).to_host()
-    geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
-    return ramp_fbp(stream, Radiographs(stream, scan, 1), geometry, grid).to_host()
+        katsevich(stream, Radiographs(stream, ideal, 1), scan.geometry, grid, target=target)
+    else:
+        geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
+        ramp_fbp(stream, Radiographs(stream, scan, 1), geometry, grid, target=target)

@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
-from clra.ops.projector import ForwardProjector
 from clra.ops.registration import ESTIMATE_FIELDS, Registration
+from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
 
 Floats = NDArray[np.float64]
@@ -74,30 +73,19 @@ def reproject_and_register(
     -------
     Registered
     """
-    context, queue = stream.context, stream.queue
-    forward = [
-        ForwardProjector(context, geometry, slab, volume_order="yxz") for slab in volume.slabs
-    ]
+    project = SlabProjector(stream, volume, geometry)
     views, rows, columns = radiographs.shape
     table = np.empty((views, len(ESTIMATE_FIELDS)))
     for chunk in stream.chunks(views, radiographs.view_bytes):
         stream.report(stage, chunk.start, views)
         measured = stream.upload(radiographs.read(chunk))
         simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
-        ready: list[cl.Event] = []
-        for index, projector in enumerate(forward):
-            event = projector(
-                queue,
-                simulated,
-                volume.get(index),
-                views=chunk,
-                accumulate=index > 0,
-                wait_for=ready,
-            )
-            ready = [event]
+        projected = project(simulated, chunk)
         estimates = stream.empty((chunk.stop - chunk.start, len(ESTIMATE_FIELDS)))
         known = stream.upload(np.log(magnification[chunk]).astype(np.float32))
-        registration(queue, estimates, measured, simulated, known, wait_for=ready).wait()
+        registration(
+            stream.queue, estimates, measured, simulated, known, wait_for=[projected]
+        ).wait()
         table[chunk] = stream.download(estimates)
     stream.report(stage, views, views)
     return _in_full_pixels(table, radiographs.level, lost)

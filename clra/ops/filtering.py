@@ -11,7 +11,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
-from clra.ops.scratch import Allocator, Scratch
+from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
 
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
@@ -87,6 +87,8 @@ class RampFilter:
         As for :class:`clra.ops.fft.RealFFT`; with "scipy" a call blocks the host.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch: fewer lines are treated at a time.
 
     Attributes
     ----------
@@ -118,6 +120,7 @@ class RampFilter:
         extend: bool = False,
         backend: str | None = None,
         allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
     ) -> None:
         if window not in WINDOWS:
             raise ValueError(f"window: found {window!r}, expected one of {', '.join(WINDOWS)}")
@@ -128,8 +131,8 @@ class RampFilter:
         self.padded = fast_length(context, 2 * (self._columns + margin), backend)
         cpu = opencl.is_cpu(opencl.device_of(context))
         self._lanes = 8 if cpu else 2
-        most = max(1, (_CPU_BYTES if cpu else _GPU_BYTES) // (4 * self.padded))
-        lines = (min(self._views * self._rows, most, _MOST_LINES), 1, self.padded)
+        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)
+        lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
         memory = Scratch(context, allocator)
         self._lines = memory.empty(lines)
         self._fft = RealFFT(context, lines, (2,), backend, allocator=memory)

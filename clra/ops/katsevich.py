@@ -11,7 +11,7 @@ from pyopencl.array import Array
 from clra.model.helix import Helix
 from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
-from clra.ops.scratch import Allocator, Scratch
+from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
 
 # Filter lines a row of the window. At the edges of a phantom the volume's error is 2.5 % larger
@@ -49,6 +49,8 @@ class KatsevichFilter:
         As for :class:`clra.ops.fft.RealFFT`; with "scipy" a call blocks the host.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch: fewer lines are treated at a time.
 
     Attributes
     ----------
@@ -74,6 +76,7 @@ class KatsevichFilter:
         *,
         backend: str | None = None,
         allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
     ) -> None:
         rows, columns = helix.shape
         window = helix.window_rows(radius)
@@ -97,7 +100,7 @@ class KatsevichFilter:
         self._lanes = 8 if cpu else 2
         self._stride = 8 * -(-columns // 8)
         self._lines_of_rows = to_device(context, _line_positions(helix, psi, window, self._stride))
-        most = (_CPU_BYTES if cpu else _GPU_BYTES) // (4 * self.padded)
+        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)
         self._batch = max(1, min(most // self._count, self.helix.views))
         lines = (self._batch * self._count, 1, self.padded)
         transformed = (min(lines[0], max(1, most), _MOST_LINES), 1, self.padded)

@@ -14,7 +14,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops import opencl
-from clra.ops.scratch import Allocator, Scratch
+from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import to_device
 from clra.ops.transpose import Planes, Transpose
 
@@ -48,6 +48,8 @@ class Layout:
         Treat axial views as tilted ones; serves tests.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch for projections; fewer views are treated at a time, at least one.
 
     Attributes
     ----------
@@ -76,6 +78,7 @@ class Layout:
         lanes: int | None = None,
         tilted: bool = False,
         allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
     ) -> None:
         if volume_order not in VOLUME_ORDERS:
             expected = " or ".join(map(repr, VOLUME_ORDERS))
@@ -93,7 +96,8 @@ class Layout:
         self._volume_shape = (
             grid.shape if volume_order == "zyx" else (*grid.shape[1:], grid.shape[0])
         )
-        self._bytes = _CPU_BYTES if cpu else _GPU_BYTES
+        self._bytes = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
+        self._least = _LEAST_VIEWS if scratch_limit is None else 1
         self._transpose = Transpose(context, self.lanes)
         self._lines: Array | None = None
         self._volume: Array | None = None
@@ -142,7 +146,7 @@ class Layout:
     @property
     def _most(self) -> int:
         """Views that one launch treats."""
-        return max(_LEAST_VIEWS, self._bytes // (4 * self._view_elements))
+        return max(self._least, self._bytes // (4 * self._view_elements))
 
     def batches(self, count: int) -> Iterator[tuple[int, int]]:
         """Cut `count` views into runs that fit the scratch."""

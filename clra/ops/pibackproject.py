@@ -11,6 +11,7 @@ from clra.model.grid import VolumeGrid
 from clra.model.helix import Helix
 from clra.model.pi_intervals import pi_reach, pi_spans
 from clra.ops.layout import Layout
+from clra.ops.scratch import Allocator
 from clra.ops.steps import Step, to_device
 
 # Voxels along z that a work-item of a CPU sums. A view sees a short part of the volume: of longer
@@ -43,6 +44,15 @@ class PiBackProjector:
         Of the volume.
     radius : float
         Of the field of view about the axis, outside of which voxels are 0 [mm].
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch for projections: fewer views are treated at a time, at least one.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
 
     Raises
     ------
@@ -58,11 +68,22 @@ class PiBackProjector:
         grid: VolumeGrid,
         radius: float,
         *,
+        allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
         _lanes: int | None = None,
     ) -> None:
         own = helices[helix]
         self._helix, self._helices, self._radius = helix, helices, radius
-        self._layout = Layout(context, own.geometry(), grid, "yxz", _lanes)
+        self._layout = Layout(
+            context,
+            own.geometry(),
+            grid,
+            "yxz",
+            _lanes,
+            allocator=allocator,
+            scratch_limit=scratch_limit,
+        )
+        self.scratch_bytes = self._layout.scratch_bytes
         block = _VOXELS if self._layout.lanes > 1 else 1
         local = (1, 1, 1) if self._layout.lanes > 1 else (32, 8, 1)
         defines = {"LANES": self._layout.lanes, "BLOCK": block}

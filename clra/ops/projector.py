@@ -50,6 +50,8 @@ class ForwardProjector:
         Axes of the volume. "yxz" is the kernels' own order and takes no second volume.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch for projections: fewer views are treated at a time, at least one.
 
     Attributes
     ----------
@@ -75,10 +77,13 @@ class ForwardProjector:
         *,
         volume_order: str = "zyx",
         allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
         _lanes: int | None = None,
         _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted, allocator)
+        self._layout = Layout(
+            context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
+        )
         self.scratch_bytes = self._layout.scratch_bytes
         kernels = ("forwardproject.cl", "forward_columns", "forward_rays")
         self._project = Blocks(self._layout, *kernels, geometry.rows, _LINE)
@@ -180,6 +185,8 @@ class BackProjector:
         Axes of the volume. "yxz" is the kernels' own order and takes no second volume.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch for projections: fewer views are treated at a time, at least one.
 
     Attributes
     ----------
@@ -201,10 +208,13 @@ class BackProjector:
         matched: bool = False,
         volume_order: str = "zyx",
         allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
         _lanes: int | None = None,
         _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(context, geometry, grid, volume_order, _lanes, _tilted, allocator)
+        self._layout = Layout(
+            context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
+        )
         self.scratch_bytes = self._layout.scratch_bytes
         nz = grid.shape[0]
         if matched:

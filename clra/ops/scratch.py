@@ -10,6 +10,11 @@ from pyopencl.array import Array
 Allocator = Callable[[int], Any]
 
 
+def within(wanted: int, limit: int | None) -> int:
+    """Bytes of scratch to use where `wanted` are best and a caller may have set a limit."""
+    return wanted if limit is None else min(wanted, limit)
+
+
 class Scratch:
     """An operator's own memory, which the caller's allocator supplies if there is one.
 

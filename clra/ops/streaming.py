@@ -4,30 +4,25 @@ This is the one module that moves data between host and device. A CPU device wor
 own arrays: nothing is copied that can be shared.
 """
 
-import os
-import tempfile
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array
 from numpy.typing import NDArray
 
-from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.ops import opencl
+from clra.ops.memory import Budgets, DeviceMemory, HostRoom, Store
 from clra.ops.pyramid import Restrict2D
+from clra.ops.transpose import Planes, Transpose
 
 Floats = NDArray[np.float32]
-
-# Radiographs in flight at once. Large enough that launching costs nothing beside computing, small
-# enough that three of them (measured, filtered, simulated) are no burden on a laptop; at half or
-# twice the size the time of an iteration is the same within 3 %.
-_CHUNK_BYTES = 96 << 20
 
 
 @dataclass(frozen=True)
@@ -42,33 +37,37 @@ class Progress:
 Report = Callable[[Progress], None]
 
 
-def host_memory() -> int:
-    """Bytes of memory that this machine has free for us (Linux; elsewhere 4 GiB)."""
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) << 10
-    except OSError:
-        pass
-    return 4 << 30
-
-
 class Stream:
     """One device with its queue, and how much memory may be used on it and on the host.
+
+    On a CPU device buffers lie in the host's memory: the device's budget is then a part of the
+    host's, at most half of it.
 
     Parameters
     ----------
     device : str or cl.Device, optional
         As :func:`clra.ops.opencl.choose_device` takes it.
     max_device_memory, max_host_memory : int, optional
-        Bytes; by default 3/4 of the device's memory and half of what the host has available.
+        Bytes; by default 3/4 of the device's memory and half of what the host has available. The
+        host's counts what comes on top of the imported modules and built kernels.
     report : callable, optional
         Called with a :class:`Progress` as work goes on.
+
+    Attributes
+    ----------
+    memory : DeviceMemory
+        Allocator for arrays and operators; it stops at the budget.
+    device_budget, host_budget : int
+        Bytes.
+    scratch_limit : int
+        Bytes of scratch memory that an operator should not exceed, for those that take a limit.
 
     Raises
     ------
     NoDeviceError
         If there is no such device.
+    ValueError
+        If a budget is not positive.
     """
 
     def __init__(
@@ -82,11 +81,17 @@ class Stream:
         self.device = opencl.choose_device(device)
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
-        self.device_budget = max_device_memory or self.device.global_mem_size * 3 // 4
-        self.host_budget = max_host_memory or host_memory() // 2
-        self.largest_buffer = min(self.device.max_mem_alloc_size, self.device_budget // 2)
+        budgets = Budgets.of(self.device, max_device_memory, max_host_memory)
+        self.device_budget, self.host_budget = budgets.device, budgets.host
+        self.scratch_limit = budgets.scratch
+        self.piece_bytes = budgets.piece
+        self._budgets = budgets
+        self.memory = DeviceMemory(self.context, budgets.device)
+        self.room = HostRoom(budgets.kept)
         self._report = report
         self._shared = opencl.is_cpu(self.device)
+        # Copies to the device have a queue of their own, to run beside the kernels.
+        self._copies = self.queue if self._shared else cl.CommandQueue(self.context)
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Tell the caller how far a stage is."""
@@ -96,43 +101,64 @@ class Stream:
     def upload(self, host: Floats) -> cl.array.Array:
         """Give the device a C-ordered float32 array; a CPU reads it in place.
 
-        The array has to be kept until the device has done with it.
+        What is enqueued on :attr:`queue` afterwards finds it there. The array has to be kept, and
+        left as it is, until the device has done with it.
         """
-        flags = cl.mem_flags
-        mode = flags.USE_HOST_PTR if self._shared else flags.COPY_HOST_PTR
-        buffer = cl.Buffer(self.context, flags.READ_ONLY | mode, hostbuf=host)
-        return cl.array.Array(self.queue, host.shape, host.dtype, data=buffer)
+        if self._shared:
+            flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
+            shared = cl.Buffer(self.context, flags, hostbuf=host)
+            return cl.array.Array(self.queue, host.shape, host.dtype, data=shared)
+        array = self.empty(host.shape)
+        buffer: Any = array.base_data
+        copied = cl.enqueue_copy(self._copies, buffer, host, is_blocking=False)
+        cl.enqueue_barrier(self.queue, wait_for=[copied])
+        return array
 
     def empty(self, shape: tuple[int, ...]) -> cl.array.Array:
         """Device array of float32 with undefined contents."""
-        return cl.array.empty(self.queue, shape, np.float32)
+        return cl.array.empty(self.queue, shape, np.float32, allocator=self.memory)
 
     def download(self, array: cl.array.Array) -> Floats:
         """Copy of a device array on the host, when all that was enqueued is done."""
         return np.asarray(array.get(queue=self.queue))
 
     def chunks(self, views: int, bytes_per_view: int) -> list[slice]:
-        """Cut views into runs whose radiographs fit the device comfortably."""
-        budget = min(_CHUNK_BYTES, self.device_budget // 8, self.largest_buffer)
-        size = max(1, budget // bytes_per_view)
+        """Cut views into runs whose radiographs fit the device and the host comfortably."""
+        size = max(1, self._budgets.chunk(bytes_per_view) // bytes_per_view)
         # Runs of equal length: no last one of two or three views.
-        count = -(-views // size)
-        ends = [views * k // count for k in range(count + 1)]
-        return [slice(a, b) for a, b in pairwise(ends)]
+        return _equal_runs(views, -(-views // size))
 
-    def slabs(self, grid: VolumeGrid) -> list[slice]:
-        """Cut a volume into runs of z planes that each fit one buffer and a third of the budget."""
+    def slabs(self, grid: VolumeGrid, volumes: int = 1) -> list[slice]:
+        """Cut a volume into runs of z planes that each fit one buffer and a third of the budget.
+
+        Parameters
+        ----------
+        grid : VolumeGrid
+            Of the volume.
+        volumes : int
+            How many of its kind the device has to hold at a time.
+        """
         nz, ny, nx = grid.shape
-        limit = min(self.largest_buffer, self.device_budget // 3)
+        limit = self._budgets.slab // volumes
         planes = limit // (4 * nx * ny)
         if planes < 1:
             raise opencl.DeviceMemoryError(
-                f"one plane of {ny} x {nx} voxels takes {4 * nx * ny >> 20} MiB, the device allows "
-                f"{limit >> 20} MiB: use a coarser grid or raise the memory limit"
+                f"one plane of {ny} x {nx} voxels takes {4 * nx * ny >> 10} KiB, the device allows "
+                f"{limit >> 10} KiB: use a coarser grid or raise the memory limit"
             )
-        count = -(-nz // planes)
-        ends = [nz * k // count for k in range(count + 1)]
-        return [slice(a, b) for a, b in pairwise(ends)]
+        return _equal_runs(nz, -(-nz // planes))
+
+
+def _equal_runs(total: int, count: int) -> list[slice]:
+    ends = [total * k // count for k in range(count + 1)]
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+class PlaneWriter(Protocol):
+    """Where a volume goes plane by plane, such as :class:`clra.io.slabs.SlabWriter`."""
+
+    def write(self, start: int, part: Floats, /) -> None:
+        """Take planes (n, y, x), the first of them plane `start` of the volume."""
 
 
 class Volume:
@@ -144,13 +170,18 @@ class Volume:
         Where it lives.
     grid : VolumeGrid
         Of the whole volume.
+    volumes : int
+        How many of its kind the device has to hold at a time.
     """
 
-    def __init__(self, stream: Stream, grid: VolumeGrid) -> None:
+    def __init__(self, stream: Stream, grid: VolumeGrid, *, volumes: int = 1) -> None:
         self.grid = grid
         self._stream = stream
-        self._planes = stream.slabs(grid)
-        self._parts: list[cl.array.Array | Floats | None] = [None] * len(self._planes)
+        self._planes = stream.slabs(grid, volumes)
+        self._known = [False] * len(self._planes)
+        self._whole: cl.array.Array | None = None
+        self._store: Store | None = None
+        self._transpose = Transpose(stream.context)
 
     @property
     def planes(self) -> list[slice]:
@@ -164,30 +195,93 @@ class Volume:
 
     def put(self, index: int, part: cl.array.Array) -> None:
         """Keep slab `index`: where it is if the volume is one slab, else on the host."""
-        self._parts[index] = part if len(self._parts) == 1 else self._stream.download(part)
+        self._known[index] = True
+        if len(self._planes) == 1:
+            self._whole = part
+            return
+        if self._store is None:
+            self._store = Store((math.prod(self.grid.shape),), self._stream.room)
+        start = self._start(index)
+        buffer: Any = part.base_data
+        for piece in self._pieces(part.size):
+            host = np.empty(piece.stop - piece.start, np.float32)
+            cl.enqueue_copy(
+                self._stream.queue, host, buffer, src_offset=part.offset + 4 * piece.start
+            )
+            self._store.write(start + piece.start, host)
 
     def get(self, index: int) -> cl.array.Array:
         """Slab `index` (ny, nx, planes) on the device."""
-        part = self._parts[index]
-        if part is None:
+        if not self._known[index]:
             raise RuntimeError(f"slab {index} was not computed")
-        return part if isinstance(part, cl.array.Array) else self._stream.upload(part)
+        if self._whole is not None:
+            return self._whole
+        _, ny, nx = self.grid.shape
+        planes = self._planes[index]
+        shape = (ny, nx, planes.stop - planes.start)
+        start, store = self._start(index), self._store
+        assert store is not None
+        if store.in_memory:
+            return self._stream.upload(store.read(start, start + math.prod(shape)).reshape(shape))
+        slab = self._stream.empty(shape)
+        buffer: Any = slab.base_data
+        for piece in self._pieces(slab.size):
+            part = store.read(start + piece.start, start + piece.stop)
+            cl.enqueue_copy(self._stream.queue, buffer, part, dst_offset=4 * piece.start)
+        return slab
+
+    def write(self, target: PlaneWriter) -> None:
+        """Hand the whole volume on, (z, y, x), some planes at a time."""
+        for index in range(len(self._planes)):
+            self.write_slab(index, self.get(index), target)
+
+    def write_slab(self, index: int, part: cl.array.Array, target: PlaneWriter) -> None:
+        """Hand slab `index` on, some planes at a time, whether it is kept or not."""
+        ny, nx, nz = part.shape
+        stream = self._stream
+        count = min(nz, max(1, stream.piece_bytes // (4 * ny * nx)))
+        for start in range(0, nz, count):
+            n = min(count, nz - start)
+            planes = stream.empty((n, ny, nx))
+            self._transpose(
+                stream.queue,
+                Planes(planes, nx, nx * ny, n, nx),
+                Planes(part[:, :, start:], nx * nz, nz, nx, n),
+                ny,
+            )
+            target.write(self._planes[index].start + start, stream.download(planes))
 
     def to_host(self) -> Floats:
         """Return the whole volume as a numpy array (z, y, x)."""
-        volume = np.empty(self.grid.shape, np.float32)
-        for index, planes in enumerate(self._planes):
-            part = self._parts[index]
-            host = self._stream.download(part) if isinstance(part, cl.array.Array) else part
-            volume[planes] = np.moveaxis(np.asarray(host), 2, 0)
-        return volume
+        target = HostPlanes(self.grid)
+        self.write(target)
+        return target.volume
+
+    def _start(self, index: int) -> int:
+        """First element of a slab in the store."""
+        return int(self._planes[index].start) * self.grid.shape[1] * self.grid.shape[2]
+
+    def _pieces(self, size: int) -> list[slice]:
+        return _equal_runs(size, -(-size // max(1, self._stream.piece_bytes // 4)))
+
+
+class HostPlanes:
+    """Takes the planes of a volume into a numpy array."""
+
+    def __init__(self, grid: VolumeGrid) -> None:
+        self.grid = grid
+        self.volume: Floats = np.zeros(grid.shape, np.float32)
+
+    def write(self, start: int, part: Floats) -> None:
+        """Take planes (n, y, x) from plane `start` on."""
+        self.volume[start : start + len(part)] = part
 
 
 class Radiographs:
     """The line integrals of a scan, binned, read in chunks.
 
-    Binned radiographs are read from the scan once and then kept: on the host as far as half of its
-    budget goes, beyond that in an unnamed temporary file. Full resolution is read where needed.
+    Binned radiographs are read from the scan once and then kept, on the host or, beyond its budget,
+    in an unnamed temporary file. Full resolution is read where needed.
 
     Parameters
     ----------
@@ -215,61 +309,23 @@ class Radiographs:
         """Radiographs `views`, float32 (n, rows, columns)."""
         if self._kept is None:
             return self._scan.read(views.start, views.stop)
-        return self._kept[views]
+        return self._kept.read(views.start, views.stop)
 
-    def _read_all(self) -> Floats:
+    def _read_all(self) -> Store:
         stream = self._stream
-        kept = self._room()
+        kept = Store(self.shape, stream.room)
         restrict = Restrict2D(stream.context)
         chunks = stream.chunks(self.shape[0], 4 * self._scan.shape[1] * self._scan.shape[2])
         name = f"reading radiographs, binned {self.level} x {self.level}"
         for views in chunks:
             stream.report(name, views.start, self.shape[0])
-            images = [stream.upload(self._scan.read(views.start, views.stop))]
+            measured = self._scan.read(views.start, views.stop)
+            images = stream.upload(measured)
             for _ in range(self.level.bit_length() - 1):
-                n, rows, columns = images[-1].shape
-                images.append(stream.empty((n, rows // 2, columns // 2)))
-                restrict(stream.queue, images[-1], images[-2])
-            kept[views] = stream.download(images[-1])
+                n, rows, columns = images.shape
+                halved = stream.empty((n, rows // 2, columns // 2))
+                restrict(stream.queue, halved, images)
+                images = halved
+            kept.write(views.start, stream.download(images))
         stream.report(name, self.shape[0], self.shape[0])
         return kept
-
-    def _room(self) -> Floats:
-        """Where the binned radiographs are kept."""
-        if self.shape[0] * self.view_bytes <= self._stream.host_budget // 2:
-            return np.empty(self.shape, np.float32)
-        with tempfile.TemporaryFile() as file:  # the mapping outlives the name and the handle
-            os.truncate(file.fileno(), self.shape[0] * self.view_bytes)
-            return np.memmap(file, np.float32, "r+", shape=self.shape)
-
-
-def views_that_see(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.bool_]:
-    """Whether each view's panel can see any of a grid.
-
-    Parameters
-    ----------
-    geometry : ConeBeamGeometry
-        Of the views.
-    grid : VolumeGrid
-        Volume or slab.
-
-    Returns
-    -------
-    ndarray of bool, (views,)
-        False only where the shadow of the grid's bounding box misses the panel.
-    """
-    ends = [(axis[0] - h, axis[-1] + h) for axis in grid.coordinates() for h in [grid.voxel_size]]
-    corners = np.array([(x, y, z) for x in ends[0] for y in ends[1] for z in ends[2]])
-    pixels = geometry.project(corners)
-    behind = np.isnan(pixels).any(axis=(1, 2))  # a corner behind the source: its shadow has no end
-    low = np.nanmin(pixels, axis=1, initial=np.inf)
-    high = np.nanmax(pixels, axis=1, initial=-np.inf)
-    size = np.array([geometry.columns, geometry.rows])
-    return np.asarray(behind | ((high > -1) & (low < size)).all(axis=1))
-
-
-def runs(chosen: NDArray[np.bool_]) -> Iterator[slice]:
-    """Yield the runs of consecutive chosen views."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
-    for start, stop in edges.reshape(-1, 2):
-        yield slice(int(start), int(stop))

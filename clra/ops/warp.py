@@ -8,7 +8,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.ops import opencl
-from clra.ops.scratch import Allocator, Scratch
+from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
 
 # As in warp.cl and lanes.clh.
@@ -37,6 +37,8 @@ class Warp:
         (rows, columns) of the images.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch: fewer images are treated at a time, at least one.
 
     Attributes
     ----------
@@ -57,7 +59,12 @@ class Warp:
     """
 
     def __init__(
-        self, context: cl.Context, shape: tuple[int, int], *, allocator: Allocator | None = None
+        self,
+        context: cl.Context,
+        shape: tuple[int, int],
+        *,
+        allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
     ) -> None:
         if len(shape) != 2 or min(shape) < 1:
             raise ValueError(f"shape: found {shape}, expected two positive numbers")
@@ -67,7 +74,10 @@ class Warp:
         self._lanes = 8 if cpu else 2
         rows, columns = shape
         self._stride = 2 * _MARGIN + 16 * -(-columns // 16)
-        self._most_views = max(1, (_CPU_BYTES if cpu else _GPU_BYTES) // (4 * rows * self._stride))
+        # Of two images each; as many bytes are best for one.
+        limit = None if scratch_limit is None else scratch_limit // 2
+        most = within(_CPU_BYTES if cpu else _GPU_BYTES, limit)
+        self._most_views = max(1, most // (4 * rows * self._stride))
 
         def step(name: str) -> Step:
             return Step(context, "warp.cl", name, (64, 2, 1), {"LANES": self._lanes})

@@ -6,7 +6,7 @@ import pytest
 import clra
 from clra.model.grid import VolumeGrid
 from clra.ops import opencl
-from clra.ops.streaming import Radiographs, Stream, Volume, runs, views_that_see
+from clra.ops.streaming import Radiographs, Stream, Volume
 
 PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
 
@@ -17,7 +17,7 @@ def test_chunks_cover_all_views_within_the_budget():
     assert [c.start for c in chunks[1:]] == [c.stop for c in chunks[:-1]]
     assert (chunks[0].start, chunks[-1].stop) == (0, 101)
     sizes = [c.stop - c.start for c in chunks]
-    assert max(sizes) * 100_000 <= 1 << 20
+    assert max(sizes) * 100_000 <= 1 << 19
     assert max(sizes) - min(sizes) <= 1
 
 
@@ -55,15 +55,15 @@ def test_volume_keeps_its_slabs(budget):
     assert np.array_equal(volume.to_host(), expected)
 
 
-@pytest.mark.parametrize("host", [None, 1])
+@pytest.mark.parametrize("host", [None, 40 << 10])
 def test_binned_radiographs_are_means(host):
-    geometry = clra.circular(5, shape=(13, 18), **PANEL)
-    pixels = np.random.default_rng(1).random((5, 13, 18), np.float32)
-    stream = Stream(max_device_memory=16 << 10, max_host_memory=host)
+    geometry = clra.circular(80, shape=(29, 42), **PANEL)
+    pixels = np.random.default_rng(1).random((80, 29, 42), np.float32)
+    stream = Stream(max_host_memory=host)
     radiographs = Radiographs(stream, clra.Scan(pixels, geometry), 4)
-    expected = pixels[:, :12, :16].reshape(5, 3, 4, 4, 4).mean(axis=(2, 4))
-    assert radiographs.shape == (5, *geometry.binned(4).shape)
-    assert np.allclose(radiographs.read(slice(1, 4)), expected[1:4], rtol=1e-6)
+    expected = pixels[:, :28, :40].reshape(80, 7, 4, 10, 4).mean(axis=(2, 4))
+    assert radiographs.shape == (80, *geometry.binned(4).shape)
+    assert np.allclose(radiographs.read(slice(1, 77)), expected[1:77], rtol=1e-6)
 
 
 def test_full_resolution_is_read_where_needed():
@@ -80,19 +80,3 @@ def test_full_resolution_is_read_where_needed():
     assert Counting.read == 0
     radiographs.read(slice(2, 4))
     assert Counting.read == 1
-
-
-def test_views_that_see_a_slab():
-    geometry = clra.helix(50, angle_step=0.3, z_step=1.0, shape=(20, 40), **PANEL)
-    top = VolumeGrid(shape=(4, 10, 10), voxel_size=1.0, centre=(0, 0, 20.0))
-    seen = views_that_see(geometry, top)
-    # At magnification 2 the panel of 20 mm sees 5 mm either side of its height on the axis.
-    heights = geometry.source[:, 2]
-    assert seen[np.abs(heights - 20) < 5].all()
-    assert not seen[np.abs(heights - 20) > 10].any()
-
-
-def test_runs():
-    chosen = np.array([True, True, False, True, False, False, True])
-    assert list(runs(chosen)) == [slice(0, 2), slice(3, 4), slice(6, 7)]
-    assert list(runs(np.zeros(3, bool))) == []

@@ -1,0 +1,41 @@
+"""Which views see what of a volume."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+
+
+def views_that_see(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.bool_]:
+    """Whether each view's panel can see any of a grid.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the views.
+    grid : VolumeGrid
+        Volume or slab.
+
+    Returns
+    -------
+    ndarray of bool, (views,)
+        False only where the shadow of the grid's bounding box misses the panel.
+    """
+    ends = [(axis[0] - h, axis[-1] + h) for axis in grid.coordinates() for h in [grid.voxel_size]]
+    corners = np.array([(x, y, z) for x in ends[0] for y in ends[1] for z in ends[2]])
+    pixels = geometry.project(corners)
+    behind = np.isnan(pixels).any(axis=(1, 2))  # a corner behind the source: its shadow has no end
+    low = np.nanmin(pixels, axis=1, initial=np.inf)
+    high = np.nanmax(pixels, axis=1, initial=-np.inf)
+    size = np.array([geometry.columns, geometry.rows])
+    return np.asarray(behind | ((high > -1) & (low < size)).all(axis=1))
+
+
+def runs(chosen: NDArray[np.bool_]) -> Iterator[slice]:
+    """Yield the runs of consecutive chosen views."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
+    for start, stop in edges.reshape(-1, 2):
+        yield slice(int(start), int(stop))
