@@ -1,6 +1,7 @@
 """Fixtures that every test may use."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyopencl as cl
@@ -10,8 +11,11 @@ from clra.ops import opencl
 
 
 @pytest.fixture(scope="session")
-def context() -> cl.Context:
-    return opencl.create_context()
+def context() -> Iterator[cl.Context]:
+    context = opencl.create_context()
+    builds = opencl.builds(context)  # held, so that the tests compile once
+    yield context
+    del builds
 
 
 @pytest.fixture

@@ -319,7 +319,7 @@ def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
     """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
     size = 1 if opencl.is_cpu(opencl.device_of(context)) else wanted
     while size > 1:
-        kernel = opencl.kernel(context, file, function, {"GROUP": size})
+        kernel = opencl.builds(context).kernel(file, function, {"GROUP": size})
         if all(opencl.work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
             break
         size //= 2

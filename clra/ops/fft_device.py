@@ -1,6 +1,7 @@
 """Real Fourier transforms on GPUs: see :mod:`clra.ops.fft`."""
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,39 @@ from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step
 
 
-class DeviceFFT:
-    """reikna's complex transforms of half the length.
+class _Chain:
+    """A reikna transform of one device, enqueued like any other kernel.
 
-    reikna binds a transform to one queue and takes no events, so there is a queue of its own for
-    each device, in order; markers tie it to the caller's.
+    reikna 0.9 binds a transform to a queue and takes no events. Here each of its kernels goes to
+    the queue of the call, behind the one before.
     """
+
+    def __init__(self, transform: Any) -> None:
+        self._transform = transform
+        for call in transform._kernel_calls:
+            kernel = call._kernel._kernel  # reikna's, of which `_kernel` is pyopencl's
+            kernel._kernel = partial(self._enqueue, kernel._kernel)
+
+    def __call__(
+        self, queue: cl.CommandQueue, work: Array, inverse: bool, wait_for: list[cl.Event]
+    ) -> cl.Event:
+        """Transform in place."""
+        self._queue, self._events = queue, wait_for
+        self._transform(work, work, inverse=inverse)
+        (event,) = self._events
+        del self._queue, self._events
+        return event
+
+    def _enqueue(
+        self, kernel: cl.Kernel, _: Any, size: Any, local: Any, *arguments: Any
+    ) -> cl.Event:
+        event = kernel(self._queue, size, local, *arguments, wait_for=self._events)
+        self._events = [event]
+        return event
+
+
+class DeviceFFT:
+    """reikna's complex transforms of half the length, planned for each device of the context."""
 
     def __init__(
         self,
@@ -51,29 +79,29 @@ class DeviceFFT:
             planned, axes = planned[:2], (1,)
         transform = FFT(Type(np.complex64, planned), axes=axes)
 
-        def plan(device: cl.Device) -> tuple[cl.CommandQueue, Any]:
-            queue = cl.CommandQueue(context, device)
-            return queue, transform.compile(ocl_api().Thread(queue))
+        def plan(device: cl.Device) -> _Chain:
+            # reikna wants a queue to copy constants by, which is not used any more then.
+            return _Chain(transform.compile(ocl_api().Thread(cl.CommandQueue(context, device))))
 
         self._plan = plan
         first = opencl.device_of(context)
         self._plans = {first: plan(first)}
-        self._queue, self._transform = self._plans[first]
         self._spectrum: Array | None = None
+        self._last: list[cl.Event] = []
 
     def forward(
         self, queue: cl.CommandQueue, spectrum: Array, image: Array, wait_for: list[cl.Event]
     ) -> cl.Event:
         """As :meth:`clra.ops.fft.RealFFT.forward`, of arrays that were checked."""
-        self._wait(queue, wait_for)
-        return self._signal(queue, self._forward(spectrum, image))
+        self._last = [self._forward(queue, spectrum, image, [*wait_for, *self._last])]
+        return self._last[0]
 
     def inverse(
         self, queue: cl.CommandQueue, image: Array, spectrum: Array, wait_for: list[cl.Event]
     ) -> cl.Event:
         """As :meth:`clra.ops.fft.RealFFT.inverse`, of arrays that were checked."""
-        self._wait(queue, wait_for)
-        return self._signal(queue, self._inverse(image, spectrum))
+        self._last = [self._inverse(queue, image, spectrum, [*wait_for, *self._last])]
+        return self._last[0]
 
     def apply(
         self,
@@ -87,50 +115,44 @@ class DeviceFFT:
         if self._spectrum is None:
             self._spectrum = self._memory.empty(self._spectrum_shape, np.complex64)
         spectrum = self._spectrum[: len(image)]
-        self._wait(queue, wait_for)
-        self._forward(spectrum, image)
+        event = self._forward(queue, spectrum, image, [*wait_for, *self._last])
         sizes = self._sizes(len(image))
         parts = multiplier.dtype.itemsize // np.dtype(np.float32).itemsize
-        self._multiply(
-            self._queue, spectrum.shape[::-1], spectrum, multiplier, parts, *sizes, self._two_axes
+        event = self._multiply(
+            queue,
+            spectrum.shape[::-1],
+            *(spectrum, multiplier, parts, *sizes, self._two_axes),
+            wait_for=[event],
         )
-        return self._signal(queue, self._inverse(out, spectrum))
+        self._last = [self._inverse(queue, out, spectrum, [event])]
+        return self._last[0]
 
-    def _forward(self, spectrum: Array, image: Array) -> cl.Event:
+    def _forward(
+        self, queue: cl.CommandQueue, spectrum: Array, image: Array, wait_for: list[cl.Event]
+    ) -> cl.Event:
         sizes = self._sizes(len(image))
         size = (self._width, *sizes[1:])
-        self._real_to_work(self._queue, size, self._work, image, *sizes)
-        self._transform(self._work, self._work)
-        return self._work_to_spectrum(
-            self._queue, spectrum.shape[::-1], spectrum, self._work, *sizes, self._two_axes
-        )
+        event = self._real_to_work(queue, size, self._work, image, *sizes, wait_for=wait_for)
+        event = self._planned(queue)(queue, self._work, False, [event])
+        arguments = (spectrum, self._work, *sizes, self._two_axes)
+        return self._work_to_spectrum(queue, spectrum.shape[::-1], *arguments, wait_for=[event])
 
-    def _inverse(self, image: Array, spectrum: Array) -> cl.Event:
+    def _inverse(
+        self, queue: cl.CommandQueue, image: Array, spectrum: Array, wait_for: list[cl.Event]
+    ) -> cl.Event:
         sizes = self._sizes(len(image))
         size = (self._width, *sizes[1:])
-        self._spectrum_to_work(self._queue, size, self._work, spectrum, *sizes, self._two_axes)
-        self._transform(self._work, self._work, inverse=True)
-        return self._work_to_real(self._queue, size, image, self._work, *sizes)
+        arguments = (self._work, spectrum, *sizes, self._two_axes)
+        event = self._spectrum_to_work(queue, size, *arguments, wait_for=wait_for)
+        event = self._planned(queue)(queue, self._work, True, [event])
+        return self._work_to_real(queue, size, image, self._work, *sizes, wait_for=[event])
+
+    def _planned(self, queue: cl.CommandQueue) -> _Chain:
+        """Transform for the queue's device."""
+        if queue.device not in self._plans:
+            self._plans[queue.device] = self._plan(queue.device)
+        return self._plans[queue.device]
 
     def _sizes(self, items: int) -> tuple[int, int, int]:
         """Sizes in the order in which the kernels and their ranges take them."""
         return self._columns, self._rows, items
-
-    def _wait(self, queue: cl.CommandQueue, wait_for: list[cl.Event]) -> None:
-        """Let the own queue wait for the events and for what an in-order queue holds already."""
-        events = list(wait_for)
-        if queue.device != self._queue.device:
-            events.append(cl.enqueue_marker(self._queue))  # which may still use the work array
-            self._queue.flush()
-            if queue.device not in self._plans:
-                self._plans[queue.device] = self._plan(queue.device)
-            self._queue, self._transform = self._plans[queue.device]
-        if not queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
-            events.append(cl.enqueue_marker(queue))
-        queue.flush()
-        if events:
-            cl.enqueue_barrier(self._queue, events)
-
-    def _signal(self, queue: cl.CommandQueue, event: cl.Event) -> cl.Event:
-        self._queue.flush()
-        return cl.enqueue_marker(queue, [event])

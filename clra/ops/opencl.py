@@ -1,7 +1,9 @@
 """Devices, contexts, kernel builds and limits: the one module that knows pyopencl's machinery."""
 
 import os
+import re
 import threading
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -145,8 +147,13 @@ def choose_device(device: str | cl.Device | None = None) -> cl.Device:
     rank = {"GPU": 2, "other": 1, "CPU": 0}
     return max(
         (candidate for _, candidate in found),
-        key=lambda d: (rank[_kind(d)], d.max_compute_units, d.platform.version),
+        key=lambda d: (rank[_kind(d)], d.max_compute_units, _numbers(d.platform.version)),
     )
+
+
+def _numbers(version: str) -> list[int]:
+    """Numbers in a version, so that 10.0 is newer than 3.1."""
+    return [int(number) for number in re.findall(r"\d+", version)]
 
 
 def create_context(device: str | cl.Device | None = None) -> cl.Context:
@@ -164,41 +171,68 @@ def is_cpu(device: cl.Device) -> bool:
     return bool(device.type & cl.device_type.CPU)
 
 
-_programs: dict[tuple[int, str, tuple[str, ...]], cl.Program] = {}
-_programs_lock = threading.Lock()
-
-
-def build(
-    context: cl.Context, name: str, defines: Mapping[str, object] | None = None
-) -> cl.Program:
-    """Compile one kernel file, once a context and set of definitions; thread-safe.
+class Builds:
+    """Compiled kernel files of one context, each compiled once a set of definitions; thread-safe.
 
     Parameters
     ----------
     context : cl.Context
         Where to build, for all its devices.
-    name : str
-        File in ``kernels/``.
-    defines : mapping, optional
-        Preprocessor definitions.
-
-    Returns
-    -------
-    cl.Program
-
-    Raises
-    ------
-    KernelBuildError
-        With the compiler's log.
     """
-    options = [*BUILD_OPTIONS, *(f"-D{key}={value}" for key, value in (defines or {}).items())]
-    # The program retains its context, so that a context's address is not given to another one
-    # as long as the entry stands.
-    key = (context.int_ptr, name, tuple(options))
-    with _programs_lock:
-        if key not in _programs:
-            _programs[key] = _compile(context, name, options)
-        return _programs[key]
+
+    def __init__(self, context: cl.Context) -> None:
+        self._context = context
+        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        self._lock = threading.Lock()
+
+    def program(self, name: str, defines: Mapping[str, object] | None = None) -> cl.Program:
+        """Compile one kernel file.
+
+        Parameters
+        ----------
+        name : str
+            File in ``kernels/``.
+        defines : mapping, optional
+            Preprocessor definitions.
+
+        Returns
+        -------
+        cl.Program
+
+        Raises
+        ------
+        KernelBuildError
+            With the compiler's log.
+        """
+        options = (*BUILD_OPTIONS, *(f"-D{key}={value}" for key, value in (defines or {}).items()))
+        with self._lock:
+            if (name, options) not in self._programs:
+                self._programs[name, options] = _compile(self._context, name, options)
+            return self._programs[name, options]
+
+    def kernel(
+        self, name: str, function: str, defines: Mapping[str, object] | None = None
+    ) -> cl.Kernel:
+        """Return a new kernel object: its arguments are its owner's alone."""
+        return cl.Kernel(self.program(name, defines), function)
+
+
+_builds: weakref.WeakValueDictionary[int, Builds] = weakref.WeakValueDictionary()
+_builds_lock = threading.Lock()
+
+
+def builds(context: cl.Context) -> Builds:
+    """Compiled kernels of a context, the same object for all who ask while one of them holds it.
+
+    Operators hold it: as long as one of a context lives, nothing is compiled twice there, and after
+    the last one nothing is left that would keep the context.
+    """
+    with _builds_lock:
+        # It holds its context, whose address so is not given to another one.
+        found = _builds.get(context.int_ptr)
+        if found is None:
+            found = _builds[context.int_ptr] = Builds(context)
+        return found
 
 
 def _compile(context: cl.Context, name: str, options: Sequence[str]) -> cl.Program:
@@ -227,13 +261,6 @@ def _compile_once(context: cl.Context, name: str, options: Sequence[str]) -> cl.
     return built
 
 
-def kernel(
-    context: cl.Context, name: str, function: str, defines: Mapping[str, object] | None = None
-) -> cl.Kernel:
-    """Return a new kernel object: its arguments are its owner's alone."""
-    return cl.Kernel(build(context, name, defines), function)
-
-
 def check_array(
     name: str,
     array: Any,
@@ -259,14 +286,14 @@ def check_array(
     Raises
     ------
     TypeError
-        If it is no device array or of another type.
+        If it is no device array.
     ValueError
-        If shape, memory order or context differ.
+        If type, shape, memory order or context differ.
     """
     if not isinstance(array, cl.array.Array):
         raise TypeError(f"{name}: found {type(array).__name__}, expected a pyopencl.array.Array")
     if array.dtype != np.dtype(dtype):
-        raise TypeError(f"{name}: found {array.dtype}, expected {np.dtype(dtype)}")
+        raise ValueError(f"{name}: found {array.dtype}, expected {np.dtype(dtype)}")
     if array.shape != tuple(shape):
         raise ValueError(f"{name}: found shape {array.shape}, expected {tuple(shape)}")
     if not array.flags.c_contiguous:

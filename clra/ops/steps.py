@@ -33,7 +33,8 @@ class Step:
         local: Sequence[int],
         defines: Mapping[str, object] | None = None,
     ) -> None:
-        self._kernel = opencl.kernel(context, file, function, defines)
+        self._builds = opencl.builds(context)  # held, so that others find it
+        self._kernel = self._builds.kernel(file, function, defines)
         self._wanted = tuple(local)
         self._allowed: dict[cl.Device, tuple[int, ...]] = {}
 

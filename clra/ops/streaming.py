@@ -81,6 +81,7 @@ class Stream:
         self.device = opencl.choose_device(device)
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
+        self._builds = opencl.builds(self.context)  # held: operators come and go
         budgets = Budgets.of(self.device, max_device_memory, max_host_memory)
         self.device_budget, self.host_budget = budgets.device, budgets.host
         self.scratch_limit = budgets.scratch

@@ -25,7 +25,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 def test_names_and_arguments_are_those_of_the_built_kernels(context, file, defines):
     built = {
         kernel.function_name: kernel.num_args
-        for kernel in opencl.build(context, file, defines).all_kernels()
+        for kernel in opencl.builds(context).program(file, defines).all_kernels()
     }
     found = {
         one.name: len(one.arguments)

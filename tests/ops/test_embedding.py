@@ -174,6 +174,14 @@ def expected(case, context, queue) -> np.ndarray:
     return _expected[id(case)]
 
 
+def settles(holds: Callable[[], bool]) -> bool:
+    """Whether it holds soon: drivers let go of what they have done when they get round to it."""
+    deadline = time.monotonic() + 5
+    while not holds() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return holds()
+
+
 def test_in_a_foreign_context_and_queue_which_it_leaves_as_they_are(case, context, expected):
     theirs = cl.Context(context.devices)
     queue = cl.CommandQueue(theirs)
@@ -182,7 +190,7 @@ def test_in_a_foreign_context_and_queue_which_it_leaves_as_they_are(case, contex
     np.testing.assert_array_equal(result(case, operator, queue), expected)
     assert queue.context == theirs
     del operator
-    assert queue.reference_count == references
+    assert settles(lambda: queue.reference_count == references)
 
 
 def test_out_of_order_it_waits_for_what_it_is_told(case, context, expected):
@@ -239,14 +247,10 @@ def test_a_foreign_buffer_wrapped_in_an_array(case, context, queue, expected):
 
 def context_of_two(context: cl.Context) -> cl.Context:
     """Two sub-devices of the device, as somebody else's context."""
-    try:
-        equally = cl.device_partition_property.EQUALLY
-        devices = context.devices[0].create_sub_devices([equally, 1])
-    except cl.Error as error:
-        pytest.skip(f"no sub-devices: {error}")
-    if len(devices) < 2:
-        pytest.skip("one compute unit: no two sub-devices")
-    return cl.Context(devices[:2])
+    device = context.devices[0]
+    if device.partition_max_sub_devices < 2:  # Rusticl of Mesa 22 crashes where it should refuse
+        pytest.skip("no sub-devices")
+    return cl.Context(device.create_sub_devices([cl.device_partition_property.EQUALLY, 1])[:2])
 
 
 def test_on_the_queues_device_of_a_context_of_two(case, context, expected):
@@ -265,8 +269,8 @@ def test_reiknas_transform_follows_the_queues_device(context):
         queue = cl.CommandQueue(theirs, device)
         spectrum = cl_array.empty(queue, (3, 1, 9), np.complex64)
         transform.forward(queue, spectrum, cl_array.to_device(queue, lines)).wait()
-        assert transform._backend._queue.device == device
         np.testing.assert_allclose(spectrum.get(), np.fft.rfft(lines), rtol=0, atol=1e-5)
+    assert set(transform._backend._plans) == set(theirs.devices)
 
 
 def test_each_thread_with_its_own_operator(case, context, expected):
@@ -356,12 +360,14 @@ class TestRefusals:
         return [cl_array.zeros(queue, shape, np.float32) for shape in shapes]
 
     def test_queue_of_another_context(self, case, context, arrays):
-        other = cl.CommandQueue(cl.Context(context.devices))
+        theirs = cl.Context(context.devices)  # held: Intel's queues do not keep their context
+        other = cl.CommandQueue(theirs)
         with pytest.raises(ValueError, match=r"queue: its context .*is not the operator's"):
             case.run(case.make(context))(other, *arrays)
 
     def test_array_of_another_context(self, case, context, queue, arrays):
-        other = cl.CommandQueue(cl.Context(context.devices))
+        theirs = cl.Context(context.devices)
+        other = cl.CommandQueue(theirs)
         arrays[-1] = cl_array.zeros(other, arrays[-1].shape, np.float32)
         with pytest.raises(ValueError, match=r"its context .* is not the operator's"):
             case.run(case.make(context))(queue, *arrays)
@@ -373,7 +379,7 @@ class TestRefusals:
 
     def test_double_precision(self, case, context, queue, arrays):
         arrays[-1] = arrays[-1].astype(np.float64)
-        with pytest.raises(TypeError, match="found float64, expected float32"):
+        with pytest.raises(ValueError, match="found float64, expected float32"):
             case.run(case.make(context))(queue, *arrays)
 
     def test_another_shape(self, case, context, queue, arrays):
@@ -392,7 +398,7 @@ def test_a_call_costs_little_more_than_the_bare_launch(context, queue):
     fine = cl_array.zeros(queue, (1, 4, 4), np.float32)
     out = cl_array.zeros(queue, (1, 2, 2), np.float32)
     operator = Restrict2D(context)
-    kernel = opencl.kernel(context, "pyramid.cl", "restrict_2d", {"LANES": 8})
+    kernel = opencl.builds(context).kernel("pyramid.cl", "restrict_2d", {"LANES": 8})
     buffers = (*opencl.buffer_argument(out), *opencl.buffer_argument(fine))
     sizes = [np.int32(n) for n in (1, 2, 2, 4, 4)]
 

@@ -14,7 +14,7 @@ DEGENERATE = [((2, 1, 8), (1, 2)), ((3, 4, 1), (2,)), ((1, 3, 2), (1, 2))]
 @pytest.fixture(scope="module", autouse=True)
 def compiler(context: cl.Context) -> None:
     """Builds once, so that a PoCL device that needs mending is mended before reikna compiles."""
-    opencl.build(context, "fft.cl")
+    opencl.builds(context).program("fft.cl")
 
 
 def image_of(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
@@ -148,7 +148,7 @@ def test_what_is_refused(context, queue):
     spectrum = cl_array.zeros(queue, transform.spectrum_shape, np.complex64)
     with pytest.raises(TypeError, match="image: found ndarray"):
         transform.forward(queue, spectrum, image.get())
-    with pytest.raises(TypeError, match="spectrum_out: found float32"):
+    with pytest.raises(ValueError, match="spectrum_out: found float32"):
         transform.forward(queue, image, image)
     with pytest.raises(ValueError, match=r"image: found shape \(3, 6, 10\)"):
         transform.forward(queue, spectrum, cl_array.zeros(queue, (3, 6, 10), np.float32))

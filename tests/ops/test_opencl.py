@@ -2,6 +2,11 @@
 
 import io
 import struct
+import time
+import types
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -10,6 +15,7 @@ import pytest
 
 from clra import kernels
 from clra.ops import opencl, pocl
+from clra.ops.pyramid import Restrict2D
 
 
 def test_devices_are_listed_and_can_be_chosen_by_what_is_listed(context):
@@ -50,18 +56,76 @@ def test_no_device_at_all_says_how_to_get_one(monkeypatch):
 
 
 def test_build_is_cached_and_a_kernel_is_not(context):
-    first, second = (opencl.build(context, "transpose.cl") for _ in range(2))
+    builds = opencl.builds(context)
+    first, second = (builds.program("transpose.cl") for _ in range(2))
     assert first is second
+    assert opencl.builds(context) is builds
     name = first.all_kernels()[0].function_name
-    assert opencl.kernel(context, "transpose.cl", name) != opencl.kernel(
-        context, "transpose.cl", name
-    )
+    assert builds.kernel("transpose.cl", name) != builds.kernel("transpose.cl", name)
+
+
+def test_builds_go_with_the_last_operator(context):
+    theirs = cl.Context(context.devices)
+    operators = [Restrict2D(theirs), Restrict2D(theirs)]
+    builds = weakref.ref(opencl.builds(theirs))
+    operators.pop()
+    assert builds() is opencl.builds(theirs)
+    operators.pop()
+    assert builds() is None
+
+
+def test_threads_compile_once(context, monkeypatch):
+    compiled = []
+
+    def slowly(context, name, options):
+        compiled.append(name)
+        time.sleep(0.05)
+        return object()
+
+    monkeypatch.setattr(opencl, "_compile", slowly)
+    theirs = cl.Context(context.devices)
+    with ThreadPoolExecutor(4) as pool:
+        held = list(pool.map(lambda _: opencl.builds(theirs), range(4)))
+        programs = list(pool.map(lambda one: one.program("warp.cl"), held))
+    assert compiled == ["warp.cl"]
+    assert len(set(map(id, programs))) == 1
+
+
+@dataclass(frozen=True)
+class Driver:
+    """As much of a device and its platform as the choice asks for."""
+
+    version: str
+    name: str = "pthread-AMD EPYC"
+    max_compute_units: int = 2
+    type: int = cl.device_type.CPU
+
+    @property
+    def platform(self) -> types.SimpleNamespace:
+        name = "Portable Computing Language"
+        return types.SimpleNamespace(name=name, version=self.version, get_devices=lambda: [self])
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_of_two_drivers_of_one_name_the_newer_unless_asked(monkeypatch, swapped):
+    old, new = Driver("OpenCL 3.0 PoCL 3.1+debian"), Driver("OpenCL 3.0 PoCL 10.0")
+    drivers = [new, old] if swapped else [old, new]
+    monkeypatch.setattr(cl, "get_platforms", lambda: [one.platform for one in drivers])
+    monkeypatch.delenv("CLRA_DEVICE", raising=False)
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    assert opencl.choose_device() is new
+    assert opencl.choose_device("pocl 3.1") is old
+    assert opencl.choose_device(f"{drivers.index(old)}:0") is old
+    with pytest.raises(
+        opencl.NoDeviceError, match=r"PoCL 3\.1\+debian.*PoCL 10|PoCL 10.*PoCL 3\.1"
+    ):
+        opencl.choose_device("pocl 7")
 
 
 def test_a_kernel_that_does_not_compile_raises_with_the_log(context, monkeypatch):
     monkeypatch.setattr(kernels, "source", lambda name: "__kernel void f( { nonsense }")
     with pytest.raises(opencl.KernelBuildError, match=r"(?s)broken\.cl.*error"):
-        opencl.build(context, "broken.cl")
+        opencl.builds(context).program("broken.cl")
 
 
 def test_check_array_names_both_sides(context, queue):
@@ -69,7 +133,7 @@ def test_check_array_names_both_sides(context, queue):
     opencl.check_array("x", good, (3, 4), context=context)
     with pytest.raises(ValueError, match=r"x: found shape \(3, 4\), expected \(4, 3\)"):
         opencl.check_array("x", good, (4, 3))
-    with pytest.raises(TypeError, match="x: found float32, expected complex64"):
+    with pytest.raises(ValueError, match="x: found float32, expected complex64"):
         opencl.check_array("x", good, (3, 4), np.complex64)
     with pytest.raises(TypeError, match=r"x: found ndarray, expected a pyopencl\.array\.Array"):
         opencl.check_array("x", np.zeros((3, 4), np.float32), (3, 4))

@@ -455,7 +455,7 @@ def test_what_is_not_an_array_of_the_device_is_refused(queue):
     volume = numbers(*GRID.shape)
     with pytest.raises(TypeError, match=r"volume: found ndarray, expected a pyopencl.array.Array"):
         operator(queue, out, volume)
-    with pytest.raises(TypeError, match=r"projections: found float64, expected float32"):
+    with pytest.raises(ValueError, match=r"projections: found float64, expected float32"):
         BackProjector(queue.context, geometry, GRID)(
             queue, on_device(queue, volume), out.astype(np.float64)
         )
