@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from clra.methods.acceleration import Anderson
 from clra.methods.fbp import ramp_fbp
 from clra.methods.outliers import from_neighbours, outliers
-from clra.methods.reprojection import Registered, reproject_and_register
+from clra.methods.reprojection import Registered, registration_for, reproject_and_register
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
 from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import Stage, converged, level_name, parse_schedule, update_size
-from clra.ops.registration import Registration
 from clra.ops.streaming import Radiographs, Report, Stream
 
 Floats = NDArray[np.float64]
@@ -35,13 +34,6 @@ GAUGES = ("anchored", "free")
 # Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
 # past it, and what they see there has to be in the re-projection too.
 _MARGIN = 0.15
-# Expected standard deviation of log(magnification): the paper's scans stay within 1 +- 0.001.
-# Panels of 500 columns tell better themselves even at quarter resolution; on small ones a slow
-# drift of the magnification along the scan is hardly seen, and would run away to 1 per cent.
-_SPREAD = 1e-3
-# Sigma of the band-pass in pixels of the level, first iteration and later: the first
-# reconstruction is blurred by the motion itself, and its fine detail is not the sample's.
-_FIRST_LOW_PASS, _LOW_PASS, _HIGH_PASS = 2.0, 1.0, 16.0
 
 
 def align(
@@ -213,20 +205,8 @@ class _Run:
             self.grid.binned(level) if level > 1 else self.grid,
             stage=f"{title}: reconstructing",
         )
-        registration = Registration(
-            stream.context,
-            geometry.shape,
-            views=max(
-                c.stop - c.start for c in stream.chunks(geometry.views, radiographs.view_bytes)
-            ),
-            low_pass=_FIRST_LOW_PASS if first else _LOW_PASS,
-            high_pass=_HIGH_PASS,
-            mask=None if self.scan.mask is None else _binned_mask(self.scan.mask, level),
-            magnification=self.scale,
-            spread=_SPREAD,
-            allocator=stream.memory,
-            # It keeps a pair's images in a dozen forms; the filters' share is free by now.
-            scratch_limit=3 * stream.scratch_limit,
+        registration = registration_for(
+            stream, self.scan, radiographs, first=first, magnification=self.scale
         )
         # 3, 4: simulate and register
         return reproject_and_register(
@@ -298,10 +278,3 @@ class _Run:
             schedule=self.schedule,
             device=self.stream.device.name.strip(),
         )
-
-
-def _binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:
-    """Bin a mask: a pixel may be used if all its parts may."""
-    rows, columns = (n // level for n in mask.shape)
-    blocks = mask[: rows * level, : columns * level].reshape(rows, level, columns, level)
-    return np.asarray(blocks.all(axis=(1, 3)))

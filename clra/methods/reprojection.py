@@ -1,17 +1,28 @@
 """Re-projection: simulate each radiograph from the volume and register the measured one with it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
+from clra.model.scan import Scan
 from clra.ops.registration import ESTIMATE_FIELDS, Registration
 from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
 
 Floats = NDArray[np.float64]
+
+# Expected standard deviation of log(magnification): the paper's scans stay within 1 +- 0.001.
+# Panels of 500 columns tell better themselves even at quarter resolution; on small ones a slow
+# drift of the magnification along the scan is hardly seen, and would run away to 1 per cent.
+_SPREAD = 1e-3
+# Sigma of the band-pass in pixels of the level, first iteration and later: the first
+# reconstruction is blurred by the motion itself, and its fine detail is not the sample's.
+_FIRST_LOW_PASS, _LOW_PASS, _HIGH_PASS = 2.0, 1.0, 16.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,117 @@ class Registered:
     sigma: Floats
 
 
+def registration_for(
+    stream: Stream, scan: Scan, radiographs: Radiographs, *, first: bool, magnification: bool
+) -> Registration:
+    """Return the estimator for radiographs of a level.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        At full resolution, with its mask.
+    radiographs : Radiographs
+        Of the level.
+    first : bool
+        Whether the volume is blurred by motion not known yet.
+    magnification : bool
+        Whether to estimate it.
+    """
+    views, rows, columns = radiographs.shape
+    chunks = stream.chunks(views, radiographs.view_bytes)
+    return Registration(
+        stream.context,
+        (rows, columns),
+        views=max(chunk.stop - chunk.start for chunk in chunks),
+        low_pass=_FIRST_LOW_PASS if first else _LOW_PASS,
+        high_pass=_HIGH_PASS,
+        mask=None if scan.mask is None else binned_mask(scan.mask, radiographs.level),
+        magnification=magnification,
+        spread=_SPREAD,
+        allocator=stream.memory,
+        # It keeps a pair's images in a dozen forms; the filters' share is free by now.
+        scratch_limit=3 * stream.scratch_limit,
+    )
+
+
+def binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:
+    """Bin a mask: a pixel may be used if all its parts may."""
+    rows, columns = (n // level for n in mask.shape)
+    blocks = mask[: rows * level, : columns * level].reshape(rows, level, columns, level)
+    return np.asarray(blocks.all(axis=(1, 3)))
+
+
+def reprojected(
+    stream: Stream, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, stage: str
+) -> Iterator[tuple[slice, Array, Array]]:
+    """Yield the measured radiographs and their simulated twins, a chunk of views at a time.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    radiographs : Radiographs
+        Measured line integrals at the resolution of `geometry`.
+    volume : Volume
+        Reconstruction.
+    geometry : ConeBeamGeometry
+        Of the radiographs, with the motion known so far absorbed.
+    stage : str
+        What progress reports call this.
+
+    Yields
+    ------
+    views : slice
+        Of the scan.
+    measured, simulated : cl.array.Array
+        float32 (n, rows, columns), valid until the next chunk.
+    """
+    project = SlabProjector(stream, volume, geometry)
+    views, rows, columns = radiographs.shape
+    for chunk in stream.chunks(views, radiographs.view_bytes):
+        stream.report(stage, chunk.start, views)
+        measured = stream.upload(radiographs.read(chunk))
+        simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
+        project(simulated, chunk)
+        yield chunk, measured, simulated
+        stream.queue.finish()
+        del measured, simulated
+    stream.report(stage, views, views)
+
+
+def register(
+    stream: Stream,
+    registration: Registration,
+    measured: Array,
+    simulated: Array,
+    magnification: Floats,
+) -> Floats:
+    """Register pairs of radiographs.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device.
+    registration : Registration
+        Estimator for radiographs of this size.
+    measured, simulated : cl.array.Array
+        float32 (n, rows, columns), line integrals.
+    magnification : ndarray, (n,)
+        That the simulation was made with; the registration may expect it to be close to 1.
+
+    Returns
+    -------
+    ndarray, (n, fields)
+        A row a pair, see ``ESTIMATE_FIELDS``.
+    """
+    estimates = stream.empty((len(magnification), len(ESTIMATE_FIELDS)))
+    known = stream.upload(np.log(magnification).astype(np.float32))
+    registration(stream.queue, estimates, measured, simulated, known).wait()
+    return stream.download(estimates).astype(np.float64)
+
+
 def reproject_and_register(
     stream: Stream,
     radiographs: Radiographs,
@@ -51,47 +173,39 @@ def reproject_and_register(
 
     Parameters
     ----------
-    stream : Stream
-        Device and memory budget.
-    radiographs : Radiographs
-        Measured line integrals at the resolution of `geometry`.
-    volume : Volume
-        Reconstruction.
-    geometry : ConeBeamGeometry
-        Of the radiographs, with the motion known so far absorbed: what is found comes on top.
+    stream, radiographs, volume, geometry, stage
+        As for :func:`reprojected`; what is found comes on top of the motion in `geometry`.
     registration : Registration
         Estimator for radiographs of this size.
     magnification : ndarray, (views,)
-        That `geometry` has absorbed; the registration may expect it to be close to 1.
+        That `geometry` has absorbed.
     lost : (int, int)
-        Rows and columns of the full-resolution panel that binning dropped: the magnification is
-        about the binned panel's centre, which lies half of that away.
-    stage : str
-        What progress reports call this.
+        As for :func:`in_full_pixels`.
 
     Returns
     -------
     Registered
     """
-    project = SlabProjector(stream, volume, geometry)
-    views, rows, columns = radiographs.shape
-    table = np.empty((views, len(ESTIMATE_FIELDS)))
-    for chunk in stream.chunks(views, radiographs.view_bytes):
-        stream.report(stage, chunk.start, views)
-        measured = stream.upload(radiographs.read(chunk))
-        simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
-        projected = project(simulated, chunk)
-        estimates = stream.empty((chunk.stop - chunk.start, len(ESTIMATE_FIELDS)))
-        known = stream.upload(np.log(magnification[chunk]).astype(np.float32))
-        registration(
-            stream.queue, estimates, measured, simulated, known, wait_for=[projected]
-        ).wait()
-        table[chunk] = stream.download(estimates)
-    stream.report(stage, views, views)
-    return _in_full_pixels(table, radiographs.level, lost)
+    table = np.empty((geometry.views, len(ESTIMATE_FIELDS)))
+    for views, measured, simulated in reprojected(stream, radiographs, volume, geometry, stage):
+        known = magnification[views]
+        table[views] = register(stream, registration, measured, simulated, known)
+    return in_full_pixels(table, radiographs.level, lost)
 
 
-def _in_full_pixels(table: Floats, level: int, lost: tuple[int, int]) -> Registered:
+def in_full_pixels(table: Floats, level: int, lost: tuple[int, int]) -> Registered:
+    """Translate what was registered at a level to full resolution.
+
+    Parameters
+    ----------
+    table : ndarray, (views, fields)
+        As of :func:`register`.
+    level : int
+        Binning factor.
+    lost : (int, int)
+        Rows and columns of the full-resolution panel that binning dropped: the magnification is
+        about the binned panel's centre, which lies half of that away.
+    """
     column = {name: table[:, index] for index, name in enumerate(ESTIMATE_FIELDS)}
     magnification = column["magnification"]
     aside_u, aside_v = (0.5 * (1 - magnification) * n for n in (lost[1], lost[0]))
