@@ -23,6 +23,7 @@ _HOMES = {
     "devices": "clra.ops.opencl",
     "ForwardProjector": "clra.ops.projector",
     "BackProjector": "clra.ops.projector",
+    "AlignmentStep": "clra.ops.alignment_step",
     "as_linear_operator": "clra.ops.linear",
 }
 

@@ -10,7 +10,7 @@ import clra
 PUBLIC = (
     "ConeBeamGeometry circular helix double_helix space_filling VolumeGrid Motion Scan read_scan "
     "align reconstruct correct devices kernels ForwardProjector BackProjector "
-    "as_linear_operator"
+    "AlignmentStep as_linear_operator"
 ).split()
 
 

@@ -10,13 +10,9 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.visibility import runs, views_that_see
 from clra.ops.coverage import Coverage
-from clra.ops.filtering import RampFilter, taper
+from clra.ops.filtering import FADE, RampFilter, taper
 from clra.ops.projector import BackProjector
 from clra.ops.streaming import PlaneWriter, Radiographs, Stream, Volume
-
-# Part of the rows at the top and at the bottom over which a view fades out. Without it the border
-# of each panel leaves an edge in the volume; a tenth smooths it and costs few rays.
-FADE = 0.1
 
 
 def ramp_fbp(

@@ -67,21 +67,37 @@ class Coverage:
             raise ValueError(f"row_weight: found {weights.shape}, expected ({geometry.rows},)")
         self._context = context
         self._grid = grid
-        self._views = geometry.views
+        self._counted = (geometry.views, geometry.rows, geometry.columns)
         # One row or column is as good as two alike.
         self._panel = (max(geometry.columns, 2), max(geometry.rows, 2))
         nz, ny, nx = grid.shape
         self._coarse = (-(-nx // _ACROSS), -(-ny // _ACROSS), -(-nz // _ALONG))
-        self._matrices = to_device(context, self._coarse_matrices(geometry))
+        self._row_weight = weights
         self._weights = to_device(context, np.resize(weights, self._panel[1]))
         self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
         self.scratch_bytes = self._seen.nbytes
-        self._least = _LEAST * _most_views(geometry, weights)
-        radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
-        self._radius = radius / grid.voxel_size
         self._count = Step(context, "coverage.cl", "coverage", (16, 1, 1))
         self._normalise = Step(context, "coverage.cl", "normalise", (64, 1, 1))
         self._last: list[cl.Event] = []
+        self.set_geometry(geometry)
+
+    def set_geometry(self, geometry: ConeBeamGeometry) -> None:
+        """Take other vectors for the same views and panel; :meth:`compute` counts anew.
+
+        Raises
+        ------
+        ValueError
+            If views or panel differ.
+        """
+        found = (geometry.views, geometry.rows, geometry.columns)
+        if found != self._counted:
+            raise ValueError(
+                f"geometry: found {found}, expected {self._counted} as (views, rows, columns)"
+            )
+        self._matrices = to_device(self._context, self._coarse_matrices(geometry))
+        self._least = _LEAST * _most_views(geometry, self._row_weight)
+        radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
+        self._radius = radius / self._grid.voxel_size
 
     def _coarse_matrices(self, geometry: ConeBeamGeometry) -> np.ndarray:
         """Projection matrices from the middles of coarse voxels."""
@@ -117,7 +133,7 @@ class Coverage:
             self._weights,
             *self._coarse,
             *self._panel,
-            self._views,
+            self._counted[0],
             wait_for=[*(wait_for or ()), *self._last],
         )
         self._last = [event]

@@ -16,6 +16,10 @@ from clra.ops.steps import Step, to_device
 
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
 
+# Part of the rows at the top and at the bottom over which a view fades out. Without it the border
+# of each panel leaves an edge in the volume; a tenth smooths it and costs few rays.
+FADE = 0.1
+
 # Bytes of padded lines in work at a time. A CPU wants them in its cache between the steps (2 to 64
 # MiB differ by 10 % on two cores); a GPU wants enough of them to fill it, and its transform takes
 # three times as much again.

@@ -1,0 +1,224 @@
+"""One iteration of re-projection alignment as an operator, for scans that fit on the device."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import pyopencl as cl
+from numpy.typing import ArrayLike
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.ops import opencl
+from clra.ops.coverage import Coverage
+from clra.ops.filtering import FADE, RampFilter, taper
+from clra.ops.projector import BackProjector, ForwardProjector
+from clra.ops.registration import ESTIMATE_FIELDS, Registration
+from clra.ops.scratch import Allocator, Scratch, within
+
+# Radiographs between two operations at a time; large enough for the launches to cost nothing.
+_CPU_BYTES, _GPU_BYTES = 32 << 20, 256 << 20
+
+
+class AlignmentStep:
+    """Reconstruct, project forward, register: steps 2 to 4 of re-projection alignment [1]_.
+
+    Of radiographs it makes the volume by ramp-filtered back-projection, divided by how many views
+    see each voxel, and the residual motion of each radiograph against its re-projection. Append
+    what it finds to the motion that the geometry has absorbed, :meth:`set_geometry`, and call
+    again.
+
+    It is :func:`clra.align`'s iteration for somebody who keeps radiographs and volume on the device
+    and writes the loop; :func:`clra.align` cuts both to fit the memory, goes through resolutions,
+    and deals with outliers and with the gauge.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where the arrays live.
+    geometry : ConeBeamGeometry
+        Of the radiographs, with the motion known so far absorbed.
+    grid : VolumeGrid
+        Of the volume, which should hold the sample.
+    row_weight : array_like, optional
+        (rows,) weights of the detector's rows in the reconstruction; by default they fade out over
+        a tenth of the rows at the top and at the bottom, see :func:`clra.ops.filtering.taper`.
+    volume_order : {"zyx", "yxz"}
+        Axes of the volume. "yxz" is the kernels' own order and takes two scratch volumes less.
+    low_pass, high_pass, mask, magnification, spread
+        As :class:`clra.ops.registration.Registration` takes them.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch of each operation and of what passes between them: fewer radiographs are
+        treated at a time, at least one.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
+
+    Raises
+    ------
+    ValueError
+        If an argument is none of the above.
+
+    References
+    ----------
+    .. [1] "Multi-resolution radiograph alignment for motion correction in X-ray micro-tomography",
+       Algorithm 1.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        *,
+        row_weight: ArrayLike | None = None,
+        volume_order: str = "zyx",
+        low_pass: float = 1.0,
+        high_pass: float = 16.0,
+        mask: ArrayLike | None = None,
+        magnification: bool = True,
+        spread: float = 0.0,
+        allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
+    ) -> None:
+        self._context, self._order = context, volume_order
+        self._shape = (geometry.views, *geometry.shape)
+        weights = taper(geometry.rows, FADE) if row_weight is None else row_weight
+        memory = Scratch(context, allocator)
+        cpu = opencl.is_cpu(opencl.device_of(context))
+        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
+        views = min(geometry.views, max(1, most // (4 * geometry.rows * geometry.columns)))
+        within_limits: dict[str, Any] = {"allocator": memory, "scratch_limit": scratch_limit}
+        self._between = memory.empty((views, *geometry.shape))
+        self._ramp = RampFilter(context, geometry, row_weight=weights, **within_limits)
+        self._coverage = Coverage(context, geometry, grid, weights, allocator=memory)
+        self._back = BackProjector(
+            context, geometry, grid, volume_order=volume_order, **within_limits
+        )
+        self._forward = ForwardProjector(
+            context, geometry, grid, volume_order=volume_order, **within_limits
+        )
+        self._registration = Registration(
+            context,
+            geometry.shape,
+            views=views,
+            low_pass=low_pass,
+            high_pass=high_pass,
+            mask=mask,
+            magnification=magnification,
+            spread=spread,
+            **within_limits,
+        )
+        self._volume_shape = (
+            grid.shape if volume_order == "zyx" else (*grid.shape[1:], grid.shape[0])
+        )
+        operations = (
+            self._ramp,
+            self._coverage,
+            self._back,
+            self._forward,
+            self._registration,
+        )
+        self.scratch_bytes = self._between.nbytes + sum(one.scratch_bytes for one in operations)
+        self._last: list[cl.Event] = []
+
+    def set_geometry(self, geometry: ConeBeamGeometry) -> None:
+        """Take other vectors for the same views and panel: the next motion.
+
+        Raises
+        ------
+        ValueError
+            If views or panel differ, or the grid reaches behind a source.
+        """
+        # The projectors first: only they may refuse the grid, and then nothing has changed.
+        for operation in (self._back, self._forward, self._ramp, self._coverage):
+            operation.set_geometry(geometry)
+
+    def __call__(
+        self,
+        queue: cl.CommandQueue,
+        estimates_out: Array,
+        volume_out: Array,
+        radiographs: Array,
+        known: Array | None = None,
+        wait_for: Sequence[cl.Event] | None = None,
+    ) -> cl.Event:
+        """Run one iteration.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        estimates_out : cl.array.Array
+            float32 (views, 10), overwritten, columns in the order of
+            :data:`clra.ops.registration.ESTIMATE_FIELDS`, as
+            :class:`~clra.ops.registration.Registration` gives them: shifts in pixels of these
+            radiographs and magnification, to append by :meth:`clra.Motion.then`.
+        volume_out : cl.array.Array
+            float32 (nz, ny, nx), or (ny, nx, nz) if so constructed, overwritten [1/mm].
+        radiographs : cl.array.Array
+            float32 (views, rows, columns), line integrals.
+        known : cl.array.Array, optional
+            float32 (views,): logarithm of the magnification that the geometry has absorbed.
+        wait_for : sequence of cl.Event, optional
+            What has to be done before.
+
+        Returns
+        -------
+        cl.Event
+            Of the last of it: volume and estimates are there.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is none of the above.
+        """
+        opencl.check_queue(queue, self._context)
+        views = self._shape[0]
+        for name, array, shape in (
+            ("estimates_out", estimates_out, (views, len(ESTIMATE_FIELDS))),
+            ("volume_out", volume_out, self._volume_shape),
+            ("radiographs", radiographs, self._shape),
+        ):
+            opencl.check_array(name, array, shape, context=self._context)
+        if known is not None:
+            opencl.check_array("known", known, (views,), context=self._context)
+        event = cl.enqueue_marker(queue, [*(wait_for or ()), *self._last])
+        event = self._reconstruct(queue, volume_out, radiographs, event)
+        for part in self._parts():
+            simulated = self._between[: part.stop - part.start]
+            event = self._forward(queue, simulated, volume_out, views=part, wait_for=[event])
+            event = self._registration(
+                queue,
+                estimates_out[part],
+                radiographs[part],
+                simulated,
+                None if known is None else known[part],
+                wait_for=[event],
+            )
+        self._last = [event]
+        return event
+
+    def _reconstruct(
+        self, queue: cl.CommandQueue, volume: Array, radiographs: Array, event: cl.Event
+    ) -> cl.Event:
+        for part in self._parts():
+            filtered = self._between[: part.stop - part.start]
+            event = self._ramp(queue, filtered, radiographs[part], views=part, wait_for=[event])
+            event = self._back(
+                queue, volume, filtered, views=part, accumulate=part.start > 0, wait_for=[event]
+            )
+        event = self._coverage.compute(queue, [event])
+        return self._coverage.normalise(
+            queue, volume, math.pi, volume_order=self._order, wait_for=[event]
+        )
+
+    def _parts(self) -> list[slice]:
+        """Cut the views into runs that fit between two operations."""
+        views, most = self._shape[0], len(self._between)
+        return [slice(start, min(views, start + most)) for start in range(0, views, most)]
