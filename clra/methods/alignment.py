@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clra.methods.acceleration import Anderson
 from clra.methods.fbp import ramp_fbp
-from clra.methods.outliers import from_neighbours, outliers
+from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
 from clra.methods.reprojection import Registered, registration_for, reproject_and_register
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
 from clra.model.gauge import Gauge, sample_points
@@ -167,6 +167,8 @@ class _Run:
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
         radiographs = Radiographs(self.stream, self.scan, stage.level)
+        if not self.history:
+            self.weak = odd_radiographs(self.stream, radiographs)
         anderson = Anderson(self.memory)
         previous = None
         for iteration in range(1, (stage.iterations or stage.limit) + 1):
@@ -203,6 +205,7 @@ class _Run:
             radiographs,
             geometry,
             self.grid.binned(level) if level > 1 else self.grid,
+            believed=~self.weak,
             stage=f"{title}: reconstructing",
         )
         registration = registration_for(

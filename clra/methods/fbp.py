@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -21,6 +22,7 @@ def ramp_fbp(
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
     *,
+    believed: NDArray[np.bool_] | None = None,
     stage: str = "back-projecting",
     target: PlaneWriter | None = None,
 ) -> Volume:
@@ -41,6 +43,8 @@ def ramp_fbp(
         Of those radiographs, with the motion absorbed.
     grid : VolumeGrid
         Where to reconstruct.
+    believed : ndarray of bool, (views,), optional
+        Views to reconstruct from, at least one; all by default.
     stage : str
         What progress reports call this.
     target : PlaneWriter, optional
@@ -60,12 +64,13 @@ def ramp_fbp(
     row_weight = taper(geometry.rows, FADE)
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
     ramp = RampFilter(context, geometry, row_weight=row_weight, **memory)
-    coverage = Coverage(context, geometry, grid, row_weight, allocator=stream.memory)
+    chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
+    coverage = Coverage(context, geometry.subset(chosen), grid, row_weight, allocator=stream.memory)
     coverage.compute(queue)
     volume = Volume(stream, grid)
     slabs = volume.slabs
-    seeing = [views_that_see(geometry, slab) for slab in slabs]
-    total, done = sum(int(chosen.sum()) for chosen in seeing), 0
+    seeing = [chosen & views_that_see(geometry, slab) for slab in slabs]
+    total, done = sum(int(views.sum()) for views in seeing), 0
     for index, slab in enumerate(slabs):
         nz, ny, nx = slab.shape
         attenuation = stream.empty((ny, nx, nz))

@@ -1,15 +1,61 @@
-"""Views whose registration failed: blank, saturated, or not of this sample."""
+"""Views that are not believed: blank, saturated, or not of this sample."""
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from clra.model.motion import Motion
+from clra.ops.streaming import Radiographs, Stream
 
 Floats = NDArray[np.float64]
 
 # A view is not believed if its correlation lies this many robust standard deviations, and at least
-# this much, below the others'.
-_DEVIATIONS, _LEAST = 5.0, 0.1
+# this much, below the others'; where all others lack little to 1, ten times what they lack will do.
+# In a stack of spheres, alike from everywhere, a wrong frame lacks 20 to 30 times as much; views of
+# a porous sample that are in order, twice.
+_DEVIATIONS, _LEAST, _LACK = 5.0, 0.1, 10.0
+# A radiograph is odd before anything is known of the sample if its mean or its contrast differs
+# from the others' by this part of it: the noise of a dark frame leaves streaks in the first volume
+# that cost twice the error of all other views; a wrong frame hardly shows.
+_ODD = 0.3
+# Neighbours in time that the ends of a scan, which look past the sample, are compared with.
+_NEIGHBOURS = 9
+
+
+def odd_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
+    """Find blank, dark and saturated radiographs by their pixels alone.
+
+    Parameters
+    ----------
+    stream : Stream
+        Memory budget.
+    radiographs : Radiographs
+        Line integrals at any resolution; all are read once.
+
+    Returns
+    -------
+    ndarray of bool, (views,)
+        Where the mean or the standard deviation of the pixels is far from those of all views and
+        from those of the views before and after as well. Fewer than half of them.
+    """
+    views = radiographs.shape[0]
+    sums = np.empty((2, views))
+    for chunk in stream.chunks(views, radiographs.view_bytes):
+        images = radiographs.read(chunk)
+        sums[0, chunk] = images.mean(axis=(1, 2), dtype=np.float64)
+        sums[1, chunk] = images.std(axis=(1, 2), dtype=np.float64)
+    odd = np.zeros(views, np.bool_)
+    for values in sums:
+        near = median_filter(values, size=_NEIGHBOURS, mode="nearest")
+        least = _ODD * abs(float(np.median(values)))
+        odd |= _far(values, np.median(values), least) & _far(values, near, least)
+    return odd if odd.sum() < views / 2 else np.zeros(views, np.bool_)
+
+
+def _far(values: Floats, expected: Floats | np.floating, least: float) -> NDArray[np.bool_]:
+    """Whether values differ from what is expected more than twice as much as nine of ten do."""
+    aside = np.abs(values - expected)
+    return np.asarray(aside > max(2 * float(np.quantile(aside, 0.9)), least))
 
 
 def outliers(correlation: Floats) -> NDArray[np.bool_]:
@@ -26,7 +72,8 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
     """
     middle = np.median(correlation)
     spread = 1.4826 * np.median(np.abs(correlation - middle))
-    return np.asarray(correlation < middle - max(_DEVIATIONS * spread, _LEAST))
+    least = min(_LEAST, _LACK * (1 - middle))
+    return np.asarray(correlation < middle - max(_DEVIATIONS * spread, least))
 
 
 def from_neighbours(motion: Motion, weak: NDArray[np.bool_]) -> Motion:

@@ -56,6 +56,22 @@ def test_slabs_and_chunks_change_nothing():
     assert np.abs(volume.to_host() - whole).max() < 1e-5 * np.abs(whole).max()
 
 
+def test_views_that_are_not_believed_are_left_out():
+    scan, _ = _scan("space-filling")
+    grid = VolumeGrid(shape=(41, 40, 38), voxel_size=1.5 * VOXEL)
+    believed = np.ones(VIEWS, np.bool_)
+    believed[[0, 7, 8, 300, VIEWS - 1]] = False
+    pixels = scan.read(0, VIEWS).copy()
+    pixels[~believed] = 1e3
+    stream = Stream()
+    spoilt = clra.Scan(pixels, scan.geometry)
+    volume = ramp_fbp(
+        stream, Radiographs(stream, spoilt, 1), scan.geometry, grid, believed=believed
+    ).to_host()
+    without = clra.reconstruct(scan.subset(believed), grid=grid)
+    assert np.abs(volume - without).max() < 1e-5 * np.abs(without).max()
+
+
 def test_motion_is_absorbed():
     geometry = clra.circular(40, shape=(31, 33), **PANEL)
     spheres = three_spheres(20 * VOXEL / 2, 25 * VOXEL)

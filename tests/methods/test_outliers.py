@@ -3,7 +3,8 @@
 import numpy as np
 
 import clra
-from clra.methods.outliers import from_neighbours, outliers
+from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
+from clra.ops.streaming import Radiographs, Stream
 
 
 def test_views_far_below_the_others_are_found():
@@ -15,6 +16,40 @@ def test_views_far_below_the_others_are_found():
 def test_views_that_are_equally_good_are_all_believed():
     assert not outliers(np.full(50, 0.99)).any()
     assert not outliers(np.linspace(0.91, 0.99, 50)).any()
+
+
+def test_where_all_fit_perfectly_little_is_already_far():
+    correlation = np.random.default_rng(0).normal(0.997, 0.0005, 200)
+    correlation[7] = 0.91
+    assert np.flatnonzero(outliers(correlation)).tolist() == [7]
+
+
+def _odd(images):
+    geometry = clra.circular(
+        len(images),
+        source_to_axis=5.0,
+        source_to_detector=50.0,
+        pixel_size=0.1,
+        shape=images.shape[1:],
+    )
+    stream = Stream()
+    return np.flatnonzero(
+        odd_radiographs(stream, Radiographs(stream, clra.Scan(images, geometry), 1))
+    ).tolist()
+
+
+def test_blank_dark_and_clipped_radiographs_are_odd_by_themselves():
+    rows = np.random.default_rng(1).normal(1.0, 0.3, (60, 17, 19)).astype(np.float32)
+    rows *= 1 + 0.2 * np.sin(2 * np.arange(60))[:, None, None]  # a sample that is not round
+    assert _odd(rows) == []
+    rows[3], rows[17], rows[40] = 0.0, 12.0, np.minimum(rows[40], 0.3)
+    assert _odd(rows) == [3, 17, 40]
+
+
+def test_ends_of_a_scan_that_look_past_the_sample_are_not_odd():
+    fading = np.clip(np.minimum(np.arange(80), np.arange(80)[::-1]) / 8, 0.05, 1.0)
+    rows = np.random.default_rng(2).normal(1.0, 0.3, (80, 17, 19)) * fading[:, None, None]
+    assert _odd(rows.astype(np.float32)) == []
 
 
 def test_weak_views_get_what_lies_between_their_neighbours():

@@ -16,7 +16,7 @@ from clra.model.grid import default_grid
 SHIFT = 6.0  # pixel, either way
 # Mean absolute errors allowed [pixel], without what the data cannot see in a parallel beam: a
 # constant in v; a constant, a cosine and a sine of the angle in u.
-TOLERANCE_U, TOLERANCE_V = 0.6, 0.15
+TOLERANCE_U, TOLERANCE_V = 0.35, 0.10
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,8 @@ def test_injected_shifts_of_a_real_scan_are_found(synchrotron, seed):
         ndimage.shift(image, (v, u), order=3, mode="nearest")
         for image, u, v in zip(measured, shift_u, shift_v, strict=True)
     ]
-    found = clra.align(clra.Scan(np.stack(moved), geometry), schedule="6QR-6HR", estimate="shift")
+    # What is slow in half a turn is the third harmonic in u; coarse iterations cost little.
+    found = clra.align(clra.Scan(np.stack(moved), geometry), schedule="12QR-6HR", estimate="shift")
     angle = np.arctan2(geometry.source[:, 0], -geometry.source[:, 1])
     unseen = np.stack([np.ones(91), np.cos(angle), np.sin(angle)], axis=1)
     error_u = found.motion.shift_u - shift_u

@@ -278,6 +278,18 @@ def test_anchoring_takes_out_what_the_sample_could_have_done() -> None:
     assert np.abs(anchored.shift_v).max() < 1e-9
 
 
+def test_a_few_views_that_went_far_do_not_move_the_sample(scan, points) -> None:
+    rest = random_motion(97, seed=5, shift=(-2, 2))
+    gauge = Gauge(scan, points, magnification=False)
+    still = gauge.anchored(rest)
+    jumped = rest.shift_u.copy()
+    jumped[[20, 60]] += 40.0
+    anchored = gauge.anchored(Motion(shift_u=jumped, shift_v=rest.shift_v))
+    others = np.delete(np.arange(97), [20, 60])
+    assert np.abs(anchored.shift_u - still.shift_u)[others].mean() < 0.1
+    assert np.abs(anchored.shift_u - still.shift_u)[[20, 60]].min() > 35
+
+
 def test_movements_that_shifts_cannot_imitate_are_no_gauge() -> None:
     """On a circle whose views see all of the sample a tilt turns its image, it hardly shifts it."""
     geometry = circular(90, **STAGE)
