@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.acceleration import Anderson
-from clra.methods.fbp import ramp_fbp
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
+from clra.methods.refinement import refined_fbp
 from clra.methods.reprojection import Registered, registration_for, reproject_and_register
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
 from clra.model.gauge import Gauge, sample_points
@@ -200,13 +200,13 @@ class _Run:
         # Motions are in full-resolution pixels: absorb first, then bin.
         geometry = self.scan.geometry.with_motion(self.motion).binned(level)
         # 2: reconstruct from the corrected radiographs
-        volume = ramp_fbp(
+        volume = refined_fbp(
             stream,
             radiographs,
             geometry,
             self.grid.binned(level) if level > 1 else self.grid,
             believed=~self.weak,
-            stage=f"{title}: reconstructing",
+            stage=title,
         )
         registration = registration_for(
             stream, self.scan, radiographs, first=first, magnification=self.scale

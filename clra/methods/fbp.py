@@ -24,6 +24,7 @@ def ramp_fbp(
     *,
     believed: NDArray[np.bool_] | None = None,
     stage: str = "back-projecting",
+    volumes: int = 1,
     target: PlaneWriter | None = None,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
@@ -47,6 +48,8 @@ def ramp_fbp(
         Views to reconstruct from, at least one; all by default.
     stage : str
         What progress reports call this.
+    volumes : int
+        How many volumes like this one the device has to hold at a time.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
 
@@ -67,7 +70,7 @@ def ramp_fbp(
     chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
     coverage = Coverage(context, geometry.subset(chosen), grid, row_weight, allocator=stream.memory)
     coverage.compute(queue)
-    volume = Volume(stream, grid)
+    volume = Volume(stream, grid, volumes=volumes)
     slabs = volume.slabs
     seeing = [chosen & views_that_see(geometry, slab) for slab in slabs]
     total, done = sum(int(views.sum()) for views in seeing), 0

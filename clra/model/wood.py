@@ -75,9 +75,7 @@ def _sites(
     return sites
 
 
-def _column(
-    x: float, y: float, width: float, height: float, random: np.random.Generator
-) -> Floats:
+def _column(x: float, y: float, width: float, height: float, random: np.random.Generator) -> Floats:
     """(x, y, z, semi-axes) of the cells of one column, end on end from a random height."""
     cells = []
     z = -0.5 * height - random.random() * _LENGTHS[0] * width
@@ -92,8 +90,12 @@ def _column(
 def _rays(radius: float, height: float, width: float, random: np.random.Generator) -> Floats:
     """(x, y, z, semi-axes) of the ray cells, thrown at random."""
     count = round(_RAYS * (radius / width) ** 2 * height / (_LENGTHS[0] * width))
-    half = 0.5 * width * np.column_stack(
-        [random.uniform(*_RAY_LENGTHS, count), np.full(count, 0.6), np.full(count, 1.2)]
+    half = (
+        0.5
+        * width
+        * np.column_stack(
+            [random.uniform(*_RAY_LENGTHS, count), np.full(count, 0.6), np.full(count, 1.2)]
+        )
     )
     angle, distance = 2 * math.pi * random.random(count), np.sqrt(random.random(count))
     # Both ends of a cell stay inside.
