@@ -190,7 +190,11 @@ def simulate(
         str, typer.Option("--panel", metavar="ROWSxCOLUMNS", help="Pixels of the detector.")
     ] = "384x256",
     phantom: Annotated[
-        str, typer.Option(metavar="spheres|porous", help="The paper's, or texture everywhere.")
+        str,
+        typer.Option(
+            metavar="spheres|porous|wood",
+            help="The paper's, texture everywhere, or hollow fibres along the axis.",
+        ),
     ] = "spheres",
     noise: Annotated[
         float | None,

@@ -15,10 +15,11 @@ from clra.model.motion import Motion
 from clra.model.perturbation import random_motion, smooth_motion
 from clra.model.phantom import Ellipsoids, porous, three_spheres
 from clra.model.scan import Scan
+from clra.model.wood import wood
 
 TRAJECTORIES = ("circular", "helix", "double-helix", "space-filling")
 MOTIONS = ("none", "random", "smooth", "both")
-PHANTOMS = ("spheres", "porous")
+PHANTOMS = ("spheres", "porous", "wood")
 
 # The paper's simulation: 3456 views of (we take) 928 rows, 0.5 degree apart on the helix, travel
 # 5.671 mm. A smaller scan keeps the fan, the turns and the travel in heights of the panel.
@@ -82,8 +83,8 @@ def sample(kind: str, geometry: ConeBeamGeometry, seed: int = 0) -> Ellipsoids:
 
     Parameters
     ----------
-    kind : {"spheres", "porous"}
-        The paper's stack of three spheres, or many small spheres.
+    kind : {"spheres", "porous", "wood"}
+        The paper's stack of three spheres, many small spheres, or hollow fibres along the axis.
     geometry : ConeBeamGeometry
         What looks at it.
     seed : int
@@ -99,7 +100,9 @@ def sample(kind: str, geometry: ConeBeamGeometry, seed: int = 0) -> Ellipsoids:
     cylinder = _cylinder(geometry)
     nz, _, nx = cylinder.shape
     radius, height = 0.5 * nx * cylinder.voxel_size, nz * cylinder.voxel_size
-    return three_spheres(radius, height) if kind == "spheres" else porous(radius, height, seed)
+    if kind == "spheres":
+        return three_spheres(radius, height)
+    return porous(radius, height, seed) if kind == "porous" else wood(radius, height, seed)
 
 
 def _cylinder(geometry: ConeBeamGeometry) -> VolumeGrid:

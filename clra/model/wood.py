@@ -104,4 +104,4 @@ def _rays(radius: float, height: float, width: float, random: np.random.Generato
     x = distance * np.cos(angle) * (radius - half[:, 0])
     inside = np.hypot(np.abs(x) + half[:, 0], np.abs(y) + half[:, 1]) <= radius
     z = (0.5 * height - half[:, 2]) * random.uniform(-1, 1, count)
-    return np.column_stack([x, y, z, half])[inside]
+    return np.asarray(np.column_stack([x, y, z, half])[inside])
