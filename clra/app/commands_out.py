@@ -29,7 +29,11 @@ def align(
         ),
     ] = "auto",
     estimate: Annotated[
-        str, typer.Option(metavar="shift|shift+scale", help="What moves in a radiograph.")
+        str,
+        typer.Option(
+            metavar="shift|shift+scale|source",
+            help="What moves in a radiograph; source: what the source causes, with parallax.",
+        ),
     ] = "shift+scale",
     gauge: Annotated[
         str,

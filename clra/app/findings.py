@@ -171,6 +171,8 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
         "magnification": f"{least:.5f} to {most:.5f}",
         "confidence": f"median {np.median(confidence):.3f}, {len(record.flagged)} views flagged",
     }
+    if "source_travel" in record.about:
+        values["source_travel"] = lines["source"] = record.about["source_travel"]
     if errors:
         means = errors.means()
         lines["error"] = (

@@ -80,6 +80,7 @@ class Record:
                 "checksum": scan_checksum(scan),
                 "schedule": result.schedule,
                 "device": result.device,
+                **_source_travel(result.motion, scan),
                 **about,
             },
         )
@@ -140,6 +141,19 @@ class Record:
 
 
 _SIGMA = ("sigma_u", "sigma_v", "sigma_magnification")
+
+
+def _source_travel(motion: Motion, scan: Scan) -> dict[str, str]:
+    """Say how far the source went, if it did."""
+    if motion.cause != "source":
+        return {}
+    geometry, moved = scan.geometry, scan.geometry.source_displacement(motion)
+    ranges = [
+        1e3 * float(np.ptp(np.sum(moved * axis, axis=1) / np.linalg.norm(axis, axis=1)))
+        for axis in (geometry.u, geometry.v, geometry.normal)
+    ]
+    across, along, toward = (f"{length:.3g}" for length in ranges)
+    return {"source_travel": f"{across}, {along}, {toward} um along columns, rows and beam"}
 
 
 def _history(file: MotionFile) -> tuple[Iteration, ...]:

@@ -23,7 +23,8 @@ _UNITS = {"shift_u": "pixel", "shift_v": "pixel", "magnification": "1"}
 _MEANING = (
     "A feature that the ideal geometry puts at pixel q = (column, row) of the full-resolution "
     "panel appears at c + magnification (q - c) + shift, c the panel's centre, shift = "
-    "(shift_u, shift_v): positive toward higher columns and higher rows."
+    "(shift_u, shift_v): positive toward higher columns and higher rows. If the cause is 'source', "
+    "this holds at the depth of the rotation axis: the source moved, and the panel did not."
 )
 
 
@@ -96,7 +97,7 @@ def write_motion_file(
             **(attributes or {}),
         )
         group = file.create_group("motion")
-        group.attrs["meaning"] = _MEANING
+        group.attrs.update(meaning=_MEANING, cause=motion.cause)
         for name, unit in _UNITS.items():
             group[name] = getattr(motion, name)
             group[name].attrs["units"] = unit
@@ -144,7 +145,7 @@ def read_motion_file(path: str | os.PathLike[str]) -> MotionFile:
                 )
         confidence = columns.pop("confidence", None)
         try:
-            motion = Motion(**columns)
+            motion = Motion(**columns, cause=text(file["motion"].attrs.get("cause", "panel")))
         except ValueError as error:
             raise InputError(f"{os.fspath(path)}: /motion: {error}") from error
         attributes = {name: text(value) for name, value in file.attrs.items()}

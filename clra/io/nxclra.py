@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.io.errors import InputError
-from clra.io.hdf5 import find
+from clra.io.hdf5 import find, text
 from clra.io.nxgeometry import CONVENTIONS
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
@@ -66,7 +66,7 @@ def write_additions(
     group["cone_vectors"].attrs["fields_are_exact"] = exact
     if truth is not None:
         motion = group.create_group("motion_truth")
-        motion.attrs["NX_class"] = "NXcollection"
+        motion.attrs.update(NX_class="NXcollection", cause=truth.cause)
         for name, unit in _MOTION_UNITS.items():
             _put(motion, name, _spread(getattr(truth, name), views, count), unit)
     if mask is not None:
@@ -101,13 +101,18 @@ def read_truth(entry: h5py.Group, views: Views, count: int) -> Motion | None:
     InputError
         If it does not fit the frames.
     """
-    columns = {}
+    columns, cause = {}, "panel"
     for name in _MOTION_UNITS:
         dataset = find(entry, f"clra/motion_truth/{name}")
         if not isinstance(dataset, h5py.Dataset):
             return None
         columns[name] = _rows(dataset, views, (count,))
-    return Motion(**columns)
+        cause = text(dataset.parent.attrs.get("cause", cause))
+    try:
+        return Motion(**columns, cause=cause)
+    except ValueError as error:
+        where = f"{entry.file.filename}: {entry.name}/clra/motion_truth"
+        raise InputError(f"{where}: {error}") from error
 
 
 def read_mask(entry: h5py.Group, other: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:

@@ -98,7 +98,10 @@ def write_nxtomo(
     geometry, reverse = top_down(geometry)
     if reverse and truth is not None:
         truth = Motion(
-            shift_u=truth.shift_u, shift_v=-truth.shift_v, magnification=truth.magnification
+            shift_u=truth.shift_u,
+            shift_v=-truth.shift_v,
+            magnification=truth.magnification,
+            cause=truth.cause,
         )
     exact = True
     if fields is None:

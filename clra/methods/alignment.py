@@ -28,7 +28,7 @@ from clra.ops.streaming import Radiographs, Report, Stream
 Floats = NDArray[np.float64]
 
 METHODS = ("ra",)
-ESTIMATES = ("shift", "shift+scale")
+ESTIMATES = ("shift", "shift+scale", "source")
 GAUGES = ("anchored", "free")
 
 # Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
@@ -63,8 +63,10 @@ def align(
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": a quarter of
         the resolution until converged (at most 6 iterations), then one at half.
-    estimate : {"shift+scale", "shift"}
-        Whether the magnification of each view is estimated or taken as 1.
+    estimate : {"shift+scale", "shift", "source"}
+        Whether the magnification of each view is estimated or taken as 1; or whether it is the
+        source that moved, in all three directions: this explains the parallax by which what is
+        near the source shifts farther than what is far from it, too.
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
@@ -112,9 +114,10 @@ def align(
     )
     grid = grid or default_grid(scan.geometry)
     grid = grid.padded(round(_MARGIN * grid.shape[0]))
-    scale, anchor = estimate == "shift+scale", gauge == "anchored"
+    scale, anchor = estimate != "shift", gauge == "anchored"
     run = _Run(stream, scan, grid, schedule, scale, memory, anchor)
-    run.motion = motion or Motion.identity(scan.views)
+    start = motion or Motion.identity(scan.views)
+    run.motion = start.caused_by("source" if estimate == "source" else "panel")
     run.truth = truth or scan.truth
     try:
         for stage in stages:
@@ -238,6 +241,7 @@ class _Run:
             shift_u=moved[0],
             shift_v=moved[1],
             magnification=np.exp(moved[2] / half) if self.scale else None,
+            cause=self.motion.cause,
         ).normalised()
         return np.asarray((there - here)[:2])
 

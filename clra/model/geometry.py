@@ -153,10 +153,11 @@ class ConeBeamGeometry:
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
     def with_motion(self, motion: Motion) -> ConeBeamGeometry:
-        """Absorb the motion of each view into the panel, so that no radiograph is resampled.
+        """Absorb the motion of each view, so that no radiograph is resampled.
 
         A point that this geometry puts at pixel q, the returned one puts at
-        ``c + magnification (q - c) + shift``, with c the panel's centre and q = (column, row).
+        ``c + magnification (q - c) + shift``, with c the panel's centre and q = (column, row); for
+        a motion of the source, only if the point lies at the depth of the axis.
 
         Parameters
         ----------
@@ -166,14 +167,48 @@ class ConeBeamGeometry:
         Returns
         -------
         ConeBeamGeometry
-            With u / m, v / m and detector - (shift_u u + shift_v v) / m.
+            With u / m, v / m and detector - (shift_u u + shift_v v) / m; for a motion of the source
+            with the source moved by `source_displacement`.
         """
         if motion.views != self.views:
             raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
+        if motion.cause == "source":
+            return ConeBeamGeometry(
+                source=self.source + self.source_displacement(motion),
+                detector=self.detector,
+                u=self.u,
+                v=self.v,
+                shape=self.shape,
+            )
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]
         detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v
         return ConeBeamGeometry(source=self.source, detector=detector, u=u, v=v, shape=self.shape)
+
+    def source_displacement(self, motion: Motion) -> Floats:
+        """Return how the source moved if that is what moved the radiographs.
+
+        Parameters
+        ----------
+        motion : Motion
+            Apparent motion of what lies at the depth of the axis, in pixels of this panel.
+
+        Returns
+        -------
+        ndarray, (views, 3)
+            Displacement (x, y, z) of the source, the panel standing still [mm]: along the panel
+            ``-shift pitch / (M' - 1)`` with the shift that is left when the magnification is taken
+            about the principal point, and toward it until SDD / SOD has become M' = m SDD / SOD.
+        """
+        to_axis, to_panel = self.source_to_axis, self.source_to_detector
+        magnified = motion.magnification * to_panel / to_axis
+        lateral = np.stack([motion.shift_u, motion.shift_v], axis=1)
+        lateral -= (1 - motion.magnification)[:, None] * (self.principal - self._centre)
+        lateral /= (1 - magnified)[:, None]
+        toward = (magnified * to_axis - to_panel) / (magnified - 1)
+        return np.asarray(
+            lateral[:, :1] * self.u + lateral[:, 1:] * self.v + toward[:, None] * self.normal
+        )
 
     def binned(self, factor: int = 2) -> ConeBeamGeometry:
         """Return the geometry of radiographs averaged over blocks of pixels.

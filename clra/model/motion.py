@@ -12,6 +12,8 @@ from clra.model.checks import column, selection, whole
 
 Floats = NDArray[np.float64]
 
+CAUSES = ("panel", "source")
+
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class Motion:
@@ -28,20 +30,34 @@ class Motion:
         Shift toward higher rows [pixel of the full-resolution panel].
     magnification : array_like, (views,), optional
         Above 1 where the radiograph appears larger; all 1 if not given.
+    cause : {"panel", "source"}
+        What moved: the radiograph in its plane, or the source. A source that moves shifts what is
+        near it farther than what is far; the numbers above are then those of a point at the depth
+        of the rotation axis.
 
     Raises
     ------
     ValueError
-        If lengths disagree, a number is not finite or a magnification is not positive.
+        If lengths disagree, a number is not finite, a magnification is not positive or `cause` is
+        none of the two.
     """
 
     shift_u: Floats
     shift_v: Floats
     magnification: Floats
+    cause: str
 
     def __init__(
-        self, *, shift_u: ArrayLike, shift_v: ArrayLike, magnification: ArrayLike | None = None
+        self,
+        *,
+        shift_u: ArrayLike,
+        shift_v: ArrayLike,
+        magnification: ArrayLike | None = None,
+        cause: str = "panel",
     ) -> None:
+        if cause not in CAUSES:
+            raise ValueError(f"cause: found {cause!r}, expected one of {CAUSES}")
+        object.__setattr__(self, "cause", cause)
         if magnification is None:
             magnification = np.ones(np.shape(shift_u))
         object.__setattr__(self, "shift_u", column("shift_u", shift_u, "views"))
@@ -59,10 +75,10 @@ class Motion:
             )
 
     @classmethod
-    def identity(cls, views: int) -> Motion:
+    def identity(cls, views: int, cause: str = "panel") -> Motion:
         """Return no motion of `views` views."""
         still = np.zeros(whole("views", views))
-        return cls(shift_u=still, shift_v=still)
+        return cls(shift_u=still, shift_v=still, cause=cause)
 
     @property
     def views(self) -> int:
@@ -77,13 +93,14 @@ class Motion:
         """Compare exactly, number by number."""
         if not isinstance(other, Motion):
             return NotImplemented
-        return np.array_equal(self._table(), other._table())
+        return self.cause == other.cause and np.array_equal(self._table(), other._table())
 
     def __repr__(self) -> str:
         """Summarise the ranges."""
         u, v, m = ((a.min(), a.max()) for a in self._table())
+        moved = " of the source" if self.cause == "source" else ""
         return (
-            f"Motion({self.views} views, shift_u {u[0]:.4g} to {u[1]:.4g} pixel, "
+            f"Motion({self.views} views{moved}, shift_u {u[0]:.4g} to {u[1]:.4g} pixel, "
             f"shift_v {v[0]:.4g} to {v[1]:.4g} pixel, magnification {m[0]:.6g} to {m[1]:.6g})"
         )
 
@@ -103,12 +120,18 @@ class Motion:
             shift_u=m * self.shift_u + residual.shift_u,
             shift_v=m * self.shift_v + residual.shift_v,
             magnification=m * self.magnification,
+            cause=self.cause,
         )
 
     def inverse(self) -> Motion:
         """Return the motion that undoes this one: ``motion.then(motion.inverse())`` is none."""
         m = self.magnification
-        return Motion(shift_u=-self.shift_u / m, shift_v=-self.shift_v / m, magnification=1 / m)
+        return Motion(
+            shift_u=-self.shift_u / m,
+            shift_v=-self.shift_v / m,
+            magnification=1 / m,
+            cause=self.cause,
+        )
 
     def normalised(self) -> Motion:
         """Return the motion with its magnifications divided by their geometric mean.
@@ -119,6 +142,16 @@ class Motion:
             shift_u=self.shift_u,
             shift_v=self.shift_v,
             magnification=self.magnification / np.exp(np.mean(np.log(self.magnification))),
+            cause=self.cause,
+        )
+
+    def caused_by(self, cause: str) -> Motion:
+        """Return the same apparent motion, of the panel or of the source."""
+        return Motion(
+            shift_u=self.shift_u,
+            shift_v=self.shift_v,
+            magnification=self.magnification,
+            cause=cause,
         )
 
     def subset(self, index: slice | ArrayLike) -> Motion:
@@ -134,6 +167,7 @@ class Motion:
             shift_u=self.shift_u[chosen],
             shift_v=self.shift_v[chosen],
             magnification=self.magnification[chosen],
+            cause=self.cause,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:

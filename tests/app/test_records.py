@@ -1,9 +1,13 @@
+import dataclasses
+
 import h5py
 import numpy as np
 
+from clra.app.findings import summary_of
 from clra.app.records import Record
 from clra.io.motions import write_motion_file
 from clra.io.scans import scan_checksum
+from clra.model.motion import Motion
 
 
 def test_a_record_survives_its_file(record, scan, motion_file):
@@ -14,6 +18,20 @@ def test_a_record_survives_its_file(record, scan, motion_file):
     assert loaded.gauge == record.gauge and loaded.sigma == record.sigma
     assert {**record.about, "version": loaded.about["version"]} == loaded.about
     assert loaded.about["checksum"] == scan_checksum(scan)
+
+
+def test_how_far_the_source_went_is_remembered_and_told(result, scan, tmp_path):
+    geometry = scan.geometry
+    pitch = np.linalg.norm(geometry.u[0])
+    magnified = geometry.source_to_detector[0] / geometry.source_to_axis[0]
+    drift = np.linspace(0, 3, scan.views)  # pixel
+    motion = Motion(shift_u=drift, shift_v=2 * drift, cause="source")
+    record = Record.of(dataclasses.replace(result, motion=motion), scan)
+    record.save(tmp_path / "motion.h5")
+    text = summary_of(Record.load(tmp_path / "motion.h5"), None)[1]
+    across = 1e3 * 3 * pitch / (magnified - 1)
+    assert f"{across:.3g}, {2 * across:.3g}, " in text
+    assert "source_travel" not in summary_of(Record.of(result, scan), None)[0]
 
 
 def test_flagged_views_are_those_without_confidence(record):

@@ -27,6 +27,19 @@ def motion() -> Motion:
     )
 
 
+def test_what_moved_survives(tmp_path: Path, motion: Motion) -> None:
+    path = tmp_path / "motion.h5"
+    motion.caused_by("source").save(path)
+    assert Motion.load(path) == motion.caused_by("source")
+    with h5py.File(path, "r+") as file:
+        file["motion"].attrs["cause"] = "stage"
+    with pytest.raises(InputError, match="/motion: cause: found 'stage', expected one of"):
+        Motion.load(path)
+    with h5py.File(path, "r+") as file:
+        del file["motion"].attrs["cause"]
+    assert Motion.load(path) == motion
+
+
 def test_everything_survives(tmp_path: Path, motion: Motion) -> None:
     path = tmp_path / "motion.h5"
     confidence = np.linspace(0, 1, 9)

@@ -185,7 +185,11 @@ def test_trajectories_survive_with_and_without_our_group(name: str, tmp_path: Pa
     geometry = TRAJECTORIES[name]
     rng = np.random.default_rng(2)
     pixels = rng.random((geometry.views, 5, 6), np.float32)
-    truth = Motion(shift_u=rng.normal(size=len(geometry)), shift_v=rng.normal(size=len(geometry)))
+    truth = Motion(
+        shift_u=rng.normal(size=len(geometry)),
+        shift_v=rng.normal(size=len(geometry)),
+        cause="source",
+    )
     mask = rng.random((5, 6)) > 0.3
     path = tmp_path / "scan.nxs"
     write_scan(path, Scan(pixels, geometry, truth=truth, mask=mask))
@@ -197,6 +201,7 @@ def test_trajectories_survive_with_and_without_our_group(name: str, tmp_path: Pa
     np.testing.assert_array_equal(scan.mask, mask[::-1])
     np.testing.assert_array_equal(scan.truth.shift_u, truth.shift_u)
     np.testing.assert_array_equal(scan.truth.shift_v, -truth.shift_v)
+    assert scan.truth.cause == "source"
     stripped = shutil.copy(path, tmp_path / "plain.nxs")
     with h5py.File(stripped, "r+") as file:
         assert file["entry/clra/cone_vectors"].attrs["fields_are_exact"]

@@ -88,6 +88,49 @@ def test_absorbed_motion_is_motion_of_the_pixels(seed):
     np.testing.assert_allclose(found, expected, atol=PIXEL)
 
 
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_a_moved_source_moves_the_pixels_of_what_lies_at_the_depth_of_the_axis(seed):
+    geometry, random = tilted(seed=4), np.random.default_rng(seed)
+    motion = Motion(
+        shift_u=random.uniform(-20, 20, 5),
+        shift_v=random.uniform(-20, 20, 5),
+        magnification=random.uniform(0.9, 1.1, 5),
+        cause="source",
+    )
+    moved = geometry.with_motion(motion)
+    for name in ("detector", "u", "v"):
+        np.testing.assert_array_equal(getattr(moved, name), getattr(geometry, name))
+    np.testing.assert_allclose(
+        moved.source - geometry.source, geometry.source_displacement(motion), atol=1e-12
+    )
+    across, along = random.uniform(-9, 9, 2)
+    centre = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
+    for view in range(5):
+        at_axis = (
+            geometry.source[view]
+            + geometry.source_to_axis[view] * geometry.normal[view]
+            + across * geometry.u[view]
+            + along * geometry.v[view]
+        )
+        before, after = (g.project(at_axis[None])[view, 0] for g in (geometry, moved))
+        shift = np.array([motion.shift_u[view], motion.shift_v[view]])
+        expected = centre + motion.magnification[view] * (before - centre) + shift
+        np.testing.assert_allclose(after, expected, atol=PIXEL)
+
+
+def test_a_source_that_moves_aside_shows_parallax():
+    # Twice as near to the source as the axis: magnified 20 times instead of 10.
+    geometry = ConeBeamGeometry(
+        source=[[0, -10, 0]], detector=[[0, 90, 0]], u=[[1, 0, 0]], v=[[0, 0, 1]], shape=SHAPE
+    )
+    moved = geometry.with_motion(Motion(shift_u=[-9], shift_v=[0], cause="source"))
+    np.testing.assert_allclose(moved.source, [[1, -10, 0]], atol=1e-12)
+    points = np.array([[0.0, 0.0, 0.0], [0.0, -5.0, 0.0]])
+    shift = moved.project(points) - geometry.project(points)
+    np.testing.assert_allclose(shift[0, :, 0], [-9, -19], atol=PIXEL)
+
+
 def test_motions_absorbed_one_after_the_other_are_one_motion():
     geometry, random = tilted(), np.random.default_rng(5)
     first, second = (

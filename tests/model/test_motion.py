@@ -48,6 +48,21 @@ def test_inverse_undoes(seed):
         np.testing.assert_allclose(none.magnification, 1, atol=ROUNDING)
 
 
+def test_what_moved_goes_along():
+    motion = any_motion(3).caused_by("source")
+    for other in (
+        motion.then(any_motion(4)),
+        motion.inverse(),
+        motion.normalised(),
+        motion.subset([2, 4]),
+    ):
+        assert other.cause == "source"
+    assert motion != any_motion(3)
+    assert Motion.identity(2, "source").cause == "source"
+    with pytest.raises(ValueError, match="cause: found 'stage', expected one of"):
+        motion.caused_by("stage")
+
+
 def test_identity_changes_nothing():
     motion = any_motion(1)
     assert motion.then(Motion.identity(7)) == motion
