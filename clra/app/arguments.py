@@ -71,6 +71,28 @@ def pixel(text: str) -> float | tuple[float, float]:
     return sizes[0] if len(sizes) == 1 else (sizes[0], sizes[1])
 
 
+def memory_size(option: str, text: str) -> int:
+    """Read a number of bytes: "512M", "2.5G", "800MiB".
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        A number, with a unit of 1024 to some power if need be.
+
+    Raises
+    ------
+    ValueError
+        If it is not that, or less than a byte.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip().lower())
+    count = int(float(found[1]) * 1024 ** " kmgt".index(found[2] or " ")) if found else 0
+    if count < 1:
+        raise ValueError(f"{option}: found {text!r}, expected a size such as 512M or 2.5G")
+    return count
+
+
 def volume_file(path: Path) -> None:
     """Check that a volume of that name can be written.
 

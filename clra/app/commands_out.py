@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from clra.app.console import Console, Reading, command
+from clra.app.console import Console, Memory, Reading, command
 
 ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
 MotionPath = Annotated[
@@ -16,6 +16,7 @@ MotionPath = Annotated[
 def align(
     console: Console,
     reading: Reading,
+    memory: Memory,
     scan: ScanPath,
     out: Annotated[
         Path, typer.Option("--output", "-o", metavar="MOTION.h5", help="Motion to write.")
@@ -65,6 +66,7 @@ def align(
     from clra.model.schedule import parse_schedule
 
     parse_schedule(schedule)
+    limits = memory.limits()
     for path in (out, report):
         if path is not None:
             ensure_writable(path)
@@ -84,6 +86,7 @@ def align(
                 gauge=gauge,
                 device=console.device,
                 progress=progress,
+                **limits,
             )
         except AlignmentInterrupted as stopped:
             record = Record.of(stopped.result, opened, interrupted="yes", **about)
@@ -98,7 +101,9 @@ def align(
         if report is not None:
             from clra.app.report import write_report
 
-            findings = findings_of(record, opened, device=console.device, progress=progress)
+            findings = findings_of(
+                record, opened, device=console.device, progress=progress, **limits
+            )
             write_report(report, findings)
     values, text = summary_of(record, errors)
     written = {"file": out, **({"report": report} if report else {})}
@@ -109,6 +114,7 @@ def align(
 def reconstruct(
     console: Console,
     reading: Reading,
+    memory: Memory,
     scan: ScanPath,
     out: Annotated[
         Path,
@@ -141,12 +147,12 @@ def reconstruct(
     from clra.app.arguments import volume_file
     from clra.app.describe import metric
     from clra.app.outputs import motion_for, room_for
-    from clra.io.volumes import write_volume
-    from clra.methods.reconstruction import METHODS
-    from clra.methods.reconstruction import reconstruct as reconstruct_scan
+    from clra.io.volumes import open_volume
+    from clra.methods.reconstruction import METHODS, reconstruct_into
     from clra.model.grid import default_grid
 
     volume_file(out)
+    limits = memory.limits()
     if motion is not None and align:
         raise ValueError("--motion, --align: found both, expected one of them")
     if method not in METHODS:
@@ -156,8 +162,9 @@ def reconstruct(
     grid = default_grid(opened.geometry)
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx)
-    with console.progress() as progress:
-        volume = reconstruct_scan(
+    with console.progress() as progress, open_volume(out, grid) as target:
+        reconstruct_into(
+            target,
             opened,
             method=method,
             grid=grid,
@@ -165,8 +172,8 @@ def reconstruct(
             align=align,
             device=console.device,
             progress=progress,
+            **limits,
         )
-        write_volume(out, volume, grid, progress=progress)
     console.summary(
         {"file": out, "shape": grid.shape, "voxel_mm": grid.voxel_size, "units": "1/mm"},
         f"wrote {out}: {nx} x {ny} x {nz} voxels of {metric(grid.voxel_size)}, in 1/mm",
@@ -176,6 +183,7 @@ def reconstruct(
 def correct(
     console: Console,
     reading: Reading,
+    memory: Memory,
     scan: ScanPath,
     motion: Annotated[
         Path, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
@@ -197,12 +205,14 @@ def correct(
     from clra.io.scans import write_scan
     from clra.methods.correction import correct as correct_scan
 
+    limits = memory.limits()
     opened = reading.scan(scan)
     known = motion_for(opened, motion)
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns)
     with console.progress() as progress:
-        write_scan(out, correct_scan(opened, known, console.device), progress=progress)
+        corrected = correct_scan(opened, known, console.device, **limits)
+        write_scan(out, corrected, progress=progress)
     console.summary(
         {"file": out, "shape": opened.shape},
         f"wrote {out}: {views} corrected radiographs of {rows} x {columns}",
@@ -212,6 +222,7 @@ def correct(
 def report(
     console: Console,
     reading: Reading,
+    memory: Memory,
     motion: Annotated[Path, typer.Argument(metavar="MOTION.h5", help="Motion from clra align.")],
     out: Annotated[
         Path, typer.Option("--output", "-o", metavar="REPORT.html", help="Page to write.")
@@ -237,13 +248,14 @@ def report(
     from clra.app.report import write_report
     from clra.io.atomic import ensure_writable
 
+    limits = memory.limits()
     record = Record.load(motion)
     ensure_writable(out)
     opened = None if scan is None else reading.scan(scan)
     if opened is not None:
         check_match(opened, record, motion)
     with console.progress() as progress:
-        findings = findings_of(record, opened, device=console.device, progress=progress)
+        findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
     write_report(out, findings)
     console.summary({"file": out}, f"wrote {out}")
 

@@ -1,7 +1,6 @@
 """The sample before and after alignment: slices, and radiographs against their re-projections."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,6 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
-
-if TYPE_CHECKING:
-    from clra.ops.streaming import Report
 
 Image = NDArray[np.float32]
 
@@ -92,29 +88,21 @@ class Comparison:
 
 
 def compare(
-    scan: Scan,
-    motion: Motion,
-    confidence: NDArray[np.float64],
-    *,
-    device: Any = None,
-    progress: "Report | None" = None,
+    stream: Stream, scan: Scan, motion: Motion, confidence: NDArray[np.float64]
 ) -> Comparison:
     """Reconstruct slices and re-project some views, without and with the motion.
 
     Parameters
     ----------
+    stream : Stream
+        Device and memory budget.
     scan : Scan
         The measured one.
     motion : Motion
         As estimated.
     confidence : ndarray, (views,)
         Of the estimate; the view with the least is shown.
-    device : str or cl.Device, optional
-        Where to compute.
-    progress : callable, optional
-        Told how far it is.
     """
-    stream = Stream(device, report=progress)
     moved = scan.geometry.with_motion(motion)
     radiographs = Radiographs(stream, scan, _level(scan, _SLICE_COLUMNS))
     grid = _grid(scan.geometry, radiographs.level)

@@ -51,6 +51,36 @@ class Console:
 
 
 @dataclass(frozen=True)
+class Memory:
+    """How much memory a command may use."""
+
+    max_device_memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE", help="On the device, such as 8G; by default 3/4 of what it has."
+        ),
+    ] = None
+    max_host_memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE",
+            help="On the host, such as 16G; by default half of what is free. What has no room goes "
+            "to temporary files. A CPU device uses half of it.",
+        ),
+    ] = None
+
+    def limits(self) -> dict[str, Any]:
+        """Return the options in bytes, by name."""
+        from clra.app.arguments import memory_size
+
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {
+            name: None if text is None else memory_size(f"--{name.replace('_', '-')}", text)
+            for name, text in given.items()
+        }
+
+
+@dataclass(frozen=True)
 class Reading:
     """How to read a scan that leaves something open."""
 

@@ -100,6 +100,8 @@ def findings_of(
     *,
     device: Any = None,
     progress: "Report | None" = None,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
 ) -> Findings:
     """Collect what a report needs; with the scan, reconstruct it before and after.
 
@@ -113,17 +115,24 @@ def findings_of(
         Where to reconstruct.
     progress : callable, optional
         Told how far it is.
+    max_device_memory, max_host_memory : int, optional
+        Bytes that may be used.
     """
     if scan is None:
         return Findings(record)
     from clra.app.comparison import compare
+    from clra.ops.streaming import Stream
 
+    stream = Stream(
+        device,
+        max_device_memory=max_device_memory,
+        max_host_memory=max_host_memory,
+        report=progress,
+    )
     return Findings(
         record,
         errors=Errors.of(record, scan),
-        comparison=compare(
-            scan, record.motion, record.confidence, device=device, progress=progress
-        ),
+        comparison=compare(stream, scan, record.motion, record.confidence),
         facts=Facts.of(scan).lines(),
     )
 
