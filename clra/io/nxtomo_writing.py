@@ -21,7 +21,7 @@ from clra.model.scan import Projections
 
 # Frames are copied in pieces of about this many bytes: small enough for any machine's memory, large
 # enough that the disk is the limit.
-_PIECE = 32 << 20
+_PIECE = 8 << 20
 
 # The layout that the files follow. From 2.0 on nxtomo speaks of axes named otherwise.
 _NXTOMO_VERSION = 1.5

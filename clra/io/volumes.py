@@ -25,7 +25,7 @@ HDF5 = (".h5", ".hdf5", ".nxs")
 TIFF = (".tif", ".tiff")
 
 # Voxels are copied in pieces of about this many bytes, as frames are.
-_PIECE = 32 << 20
+_PIECE = 8 << 20
 
 
 @contextmanager

@@ -27,8 +27,8 @@ the data see."""
 # Fewest points in a view from which three numbers are fitted.
 _FEWEST = 8
 
-# Elements of a work array: bounds the memory to a few times 4 MB, and fits a cache.
-_CHUNK = 1 << 19
+# Elements of a work array: the fifteen of them fit a cache. At eight times the size it is as quick.
+_CHUNK = 1 << 16
 
 
 def gauge_columns(
