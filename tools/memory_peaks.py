@@ -37,6 +37,10 @@ def child(method: str, scan_path: Path, out: Path, host: int | None, device: int
     import ctypes
     import gc
 
+    from clra.app.console import Memory
+
+    if host:
+        Memory(max_host_memory=str(host)).limits()  # as the command line does
     live = _count_buffers()
     import clra
     from clra.io.volumes import open_volume
@@ -135,7 +139,9 @@ def difference(method: str, one: Path, other: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=int, default=600)
-    parser.add_argument("--panel", type=int, nargs=2, default=(320, 256), metavar=("ROWS", "COLUMNS"))
+    parser.add_argument(
+        "--panel", type=int, nargs=2, default=(320, 256), metavar=("ROWS", "COLUMNS")
+    )
     parser.add_argument("--host-mib", type=int, default=64)
     parser.add_argument("--device-mib", type=int, default=32)
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)

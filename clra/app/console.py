@@ -1,9 +1,11 @@
 """Groups of options that several commands share, and where results go."""
 
+import ctypes
 import inspect
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, fields, is_dataclass
@@ -73,11 +75,25 @@ class Memory:
         """Return the options in bytes, by name."""
         from clra.app.arguments import memory_size
 
+        if self.max_host_memory is not None:
+            _give_freed_memory_back()
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         return {
             name: None if text is None else memory_size(f"--{name.replace('_', '-')}", text)
             for name, text in given.items()
         }
+
+
+def _give_freed_memory_back() -> None:
+    """Make glibc return large freed arrays to the system at once, where there is glibc.
+
+    By itself it raises the size from which it does so with every array that is freed, up to 32 MiB,
+    and then keeps as much again as is in use. This is our process, so we may tell it.
+    """
+    threshold = -3  # M_MMAP_THRESHOLD of malloc.h
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(threshold, 1 << 18)
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,7 @@ def ramp_fbp(
             volume.put(index, attenuation)
         else:
             volume.write_slab(index, attenuation, target)
+        del attenuation  # before the next slab is made
         queue.finish()
     stream.report(stage, total, total)
     return volume

@@ -111,6 +111,7 @@ def katsevich(
             volume.put(index, attenuation)
         else:
             volume.write_slab(index, attenuation, target)
+        del attenuation  # before the next slab is made
     stream.report("back-projecting", total, total)
     return volume
 
