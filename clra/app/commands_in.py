@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from clra.app.arguments import interval, panel, pixel
-from clra.app.console import Console, Reading, command
+from clra.app.console import Console, Memory, Reading, command
 
 ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
 
@@ -38,7 +38,7 @@ def devices(console: Console) -> None:
     console.result({"devices": found, "taken": taken[0] if taken else None}, "\n".join(lines))
 
 
-def info(console: Console, reading: Reading, scan: ScanPath) -> None:
+def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> None:
     """Describe a scan and what it will take.
 
     Memory and time of a reconstruction and of an iteration of alignment at each level of
@@ -53,11 +53,12 @@ def info(console: Console, reading: Reading, scan: ScanPath) -> None:
     from clra.app.estimate import Speed, costs_of, costs_table, measure
     from clra.ops.opencl import NoDeviceError
 
+    limits = memory.limits()
     opened = reading.scan(scan)
     facts = Facts.of(opened)
     try:
         with console.progress() as report:
-            speed = measure(opened.geometry, console.device, report)
+            speed = measure(opened.geometry, console.device, report, **limits)
     except NoDeviceError as error:
         if console.device:
             raise

@@ -14,6 +14,8 @@ from clra.model.grid import VolumeGrid, default_grid
 from clra.model.schedule import level_name
 
 if TYPE_CHECKING:
+    from clra.methods.needs import Need
+    from clra.ops.memory import Budgets
     from clra.ops.streaming import Report
 
 LEVELS = (1, 2, 4)
@@ -32,8 +34,8 @@ class Speed:
     ----------
     device : str
         Its name.
-    memory : int
-        Bytes that it has.
+    budgets : Budgets or None
+        Memory that may be used on it and on the host.
     back, forward : float
         To back-project, and to project forward, one voxel in one view [s].
     filtering, registering : float
@@ -41,7 +43,7 @@ class Speed:
     """
 
     device: str
-    memory: int
+    budgets: "Budgets | None"
     back: float
     forward: float
     filtering: float
@@ -50,7 +52,7 @@ class Speed:
     @classmethod
     def unknown(cls) -> "Speed":
         """Return the speed of no device."""
-        return cls("no device", 0, *[math.nan] * 4)
+        return cls("no device", None, *[math.nan] * 4)
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Cost:
         Voxels times the views that see them.
     reconstruction_s, iteration_s : float
         Time of a reconstruction, and of an iteration of alignment, without reading the scan.
+    reconstruction, iteration : Need or None
+        Memory that they take at their peaks, where there is a device.
     """
 
     level: str
@@ -81,6 +85,8 @@ class Cost:
     voxel_views: float
     reconstruction_s: float
     iteration_s: float
+    reconstruction: "Need | None" = None
+    iteration: "Need | None" = None
 
 
 def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
@@ -115,9 +121,24 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
                 voxel_views=updates,
                 reconstruction_s=reconstruction,
                 iteration_s=reconstruction + registration,
+                **_needs(speed, geometry, whole, level),
             )
         )
     return costs
+
+
+def _needs(
+    speed: Speed, geometry: ConeBeamGeometry, grid: VolumeGrid, level: int
+) -> dict[str, "Need"]:
+    if speed.budgets is None:
+        return {}
+    from clra.methods.needs import alignment_need, reconstruction_need
+
+    binned = (geometry.binned(level), grid.binned(level)) if level > 1 else (geometry, grid)
+    return {
+        "reconstruction": reconstruction_need(speed.budgets, *binned),
+        "iteration": alignment_need(speed.budgets, geometry, grid, level),
+    }
 
 
 def _views_a_voxel(geometry: ConeBeamGeometry, grid: VolumeGrid) -> float:
@@ -130,7 +151,12 @@ def _views_a_voxel(geometry: ConeBeamGeometry, grid: VolumeGrid) -> float:
 
 
 def measure(
-    geometry: ConeBeamGeometry, device: Any = None, report: "Report | None" = None
+    geometry: ConeBeamGeometry,
+    device: Any = None,
+    report: "Report | None" = None,
+    *,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
 ) -> Speed:
     """Measure the speed of a device on a small piece of work like that of a scan.
 
@@ -142,6 +168,8 @@ def measure(
         As :func:`clra.ops.opencl.choose_device` takes it.
     report : callable, optional
         Told how far the test is.
+    max_device_memory, max_host_memory : int, optional
+        Bytes that the work may use; the test itself is small.
 
     Returns
     -------
@@ -149,6 +177,7 @@ def measure(
         The first run of each operation, which builds its kernels, is not counted.
     """
     from clra.ops.filtering import RampFilter
+    from clra.ops.memory import Budgets
     from clra.ops.projector import BackProjector, ForwardProjector
     from clra.ops.registration import ESTIMATE_FIELDS, Registration
     from clra.ops.streaming import Stream
@@ -187,7 +216,8 @@ def measure(
         started = time.perf_counter()
         run().wait()
         seconds[name] = (time.perf_counter() - started) / amount
-    return Speed(stream.device.name.strip(), stream.device.global_mem_size, **seconds)
+    budgets = Budgets.of(stream.device, max_device_memory, max_host_memory)
+    return Speed(stream.device.name.strip(), budgets, **seconds)
 
 
 def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
@@ -214,19 +244,40 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
                 duration(cost.iteration_s),
             )
         )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = ["  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
-    if not speed.memory:
+    lines = _columns(rows)
+    if speed.budgets is None:
         return "\n".join(lines)
+    budgets = speed.budgets
+    within = f"{size(budgets.host)} on the host, "
+    within += "half of them for the device" if budgets.shared else f"{size(budgets.device)} on it"
     return "\n".join(
         [
             *lines,
             "",
-            f"Times are for {speed.device} ({size(speed.memory)}), without reading the scan; an "
-            "iteration is one of clra align.",
-            "Work is cut into pieces that fit the memory of the device.",
+            f"Times are for {speed.device}, without reading the scan; an iteration is one of clra "
+            "align.",
+            "",
+            *_columns(_memory_rows(costs)),
+            "",
+            f"Memory at its peak, within {within} (--max-host-memory, --max-device-memory); what "
+            "has no room goes to temporary files (TMPDIR).",
         ]
     )
+
+
+def _memory_rows(costs: Sequence[Cost]) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [("memory", "work", "device", "host", "temporary files")]
+    for cost in costs:
+        for work, need in (("reconstruction", cost.reconstruction), ("iteration", cost.iteration)):
+            if need is not None:
+                sizes = (size(need.device), size(need.host), size(need.disk))
+                rows.append((cost.level, work, *sizes))
+    return rows
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return ["  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
 
 
 def size(count: float) -> str:

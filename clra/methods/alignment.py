@@ -33,7 +33,7 @@ GAUGES = ("anchored", "free")
 
 # Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
 # past it, and what they see there has to be in the re-projection too.
-_MARGIN = 0.15
+MARGIN = 0.15
 
 
 def align(
@@ -113,7 +113,7 @@ def align(
         report=progress,
     )
     grid = grid or default_grid(scan.geometry)
-    grid = grid.padded(round(_MARGIN * grid.shape[0]))
+    grid = grid.padded(round(MARGIN * grid.shape[0]))
     scale, anchor = estimate != "shift", gauge == "anchored"
     run = _Run(stream, scan, grid, schedule, scale, memory, anchor)
     start = motion or Motion.identity(scan.views)

@@ -55,6 +55,8 @@ class Budgets:
         Arrays that stay on the host.
     piece : int
         Parts in which arrays are copied.
+    shared : bool
+        Whether the device works in the host's memory.
     """
 
     device: int
@@ -63,6 +65,7 @@ class Budgets:
     scratch: int
     kept: int
     piece: int
+    shared: bool
 
     @classmethod
     def of(cls, device: cl.Device, most_device: int | None, most_host: int | None) -> "Budgets":
@@ -72,7 +75,8 @@ class Budgets:
                 raise ValueError(f"{name}: found {value}, expected a positive number of bytes")
         host = most_host or host_memory() // 2
         budget = most_device or device.global_mem_size * 3 // 4
-        if opencl.is_cpu(device):
+        shared = opencl.is_cpu(device)
+        if shared:
             budget = min(budget, host // 2)
         return cls(
             device=budget,
@@ -81,6 +85,7 @@ class Budgets:
             scratch=budget // 12,
             kept=host // 4,
             piece=min(_PIECE_BYTES, budget // 16, host // 64),
+            shared=shared,
         )
 
     def chunk(self, view_bytes: int) -> int:

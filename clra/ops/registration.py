@@ -48,8 +48,8 @@ _MAX_STEP = 2.0
 _MAX_MAGNIFICATION = 0.05
 # Scratch memory. On two cores, half of it is 3 % slower and twice as much 2 % faster.
 _SCRATCH_CPU, _SCRATCH_GPU = 128 << 20, 512 << 20
-# Of it for a pixel of a pair: 33 for 928 x 512 pixels, 39 for 232 x 128.
-_PAIR_BYTES = 36
+# Of it for an element of a pair's lines, from 64 x 64 to 928 x 512 pixels.
+PAIR_BYTES = 32
 
 
 class Registration:
@@ -155,7 +155,7 @@ class Registration:
         if views is not None and views < 1:
             raise ValueError(f"views: found {views}, expected 1 or more")
         most = within(_SCRATCH_CPU if cpu else _SCRATCH_GPU, scratch_limit)
-        fitting = max(1, most // (_PAIR_BYTES * rows * columns))
+        fitting = max(1, most // (PAIR_BYTES * rows * line_stride(columns)))
         views = fitting if views is None else min(views, fitting)
         self._context, self._views = context, views
         self._iterations, self._magnification = iterations, int(magnification)

@@ -57,8 +57,8 @@ class Stream:
     ----------
     memory : DeviceMemory
         Allocator for arrays and operators; it stops at the budget.
-    device_budget, host_budget : int
-        Bytes.
+    budgets : Budgets
+        How they are shared out.
     scratch_limit : int
         Bytes of scratch memory that an operator should not exceed, for those that take a limit.
 
@@ -83,14 +83,12 @@ class Stream:
         self.queue = cl.CommandQueue(self.context)
         self._builds = opencl.builds(self.context)  # held: operators come and go
         budgets = Budgets.of(self.device, max_device_memory, max_host_memory)
-        self.device_budget, self.host_budget = budgets.device, budgets.host
+        self.budgets = budgets
         self.scratch_limit = budgets.scratch
-        self.piece_bytes = budgets.piece
-        self._budgets = budgets
         self.memory = DeviceMemory(self.context, budgets.device)
         self.room = HostRoom(budgets.kept)
         self._report = report
-        self._shared = opencl.is_cpu(self.device)
+        self._shared = budgets.shared
         # Copies to the device have a queue of their own, to run beside the kernels.
         self._copies = self.queue if self._shared else cl.CommandQueue(self.context)
 
@@ -125,7 +123,7 @@ class Stream:
 
     def chunks(self, views: int, bytes_per_view: int) -> list[slice]:
         """Cut views into runs whose radiographs fit the device and the host comfortably."""
-        size = max(1, self._budgets.chunk(bytes_per_view) // bytes_per_view)
+        size = max(1, self.budgets.chunk(bytes_per_view) // bytes_per_view)
         # Runs of equal length: no last one of two or three views.
         return _equal_runs(views, -(-views // size))
 
@@ -140,7 +138,7 @@ class Stream:
             How many of its kind the device has to hold at a time.
         """
         nz, ny, nx = grid.shape
-        limit = self._budgets.slab // volumes
+        limit = self.budgets.slab // volumes
         planes = limit // (4 * nx * ny)
         if planes < 1:
             raise opencl.DeviceMemoryError(
@@ -240,7 +238,7 @@ class Volume:
         """Hand slab `index` on, some planes at a time, whether it is kept or not."""
         ny, nx, nz = part.shape
         stream = self._stream
-        count = min(nz, max(1, stream.piece_bytes // (4 * ny * nx)))
+        count = min(nz, max(1, stream.budgets.piece // (4 * ny * nx)))
         for start in range(0, nz, count):
             n = min(count, nz - start)
             planes = stream.empty((n, ny, nx))
@@ -263,7 +261,7 @@ class Volume:
         return int(self._planes[index].start) * self.grid.shape[1] * self.grid.shape[2]
 
     def _pieces(self, size: int) -> list[slice]:
-        return _equal_runs(size, -(-size // max(1, self._stream.piece_bytes // 4)))
+        return _equal_runs(size, -(-size // max(1, self._stream.budgets.piece // 4)))
 
 
 class HostPlanes:

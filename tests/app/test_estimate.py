@@ -1,11 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from clra.app.estimate import Speed, costs_of, costs_table, measure, size
 from clra.app.simulate import paper_like
 from clra.model.grid import default_grid
+from clra.ops import opencl
+from clra.ops.memory import Budgets
 
-SPEED = Speed("a device", 8 << 30, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
+SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
 
 
 def test_costs_follow_from_shapes():
@@ -44,8 +48,10 @@ def test_sizes_and_table():
         "2000 TiB",
     ]
     geometry = paper_like("circular", 100, (64, 48))
-    text = costs_table(costs_of(geometry, SPEED), SPEED)
+    speed = replace(SPEED, budgets=Budgets.of(opencl.choose_device(), 1 << 30, 4 << 30))
+    text = costs_table(costs_of(geometry, speed), speed)
     assert "FR" in text and "48 x 48" not in text.splitlines()[0] and "a device" in text
+    assert "4 GiB on the host" in text
 
 
 def test_a_device_is_measured_in_a_moment():
