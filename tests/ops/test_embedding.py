@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,152 +11,19 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.tools
 import pytest
+from operator_cases import CASES, WITH_SCRATCH, Case, result, values
 
-import clra
 from clra.ops import fft, opencl
-from clra.ops.bandpass import Bandpass
-from clra.ops.correlation import PhaseCorrelation
-from clra.ops.coverage import Coverage
 from clra.ops.fft import RealFFT
-from clra.ops.filtering import RampFilter
-from clra.ops.pyramid import Prolong3D, Restrict2D, Restrict3D
-from clra.ops.registration import Registration
-from clra.ops.warp import Warp
+from clra.ops.pyramid import Restrict2D
 
 OUT_OF_ORDER = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-FORMS = 2e-5  # of the largest value: forms of a kernel for CPU and GPU differ by roundings
-REGISTERED = 1e-3  # likewise, for estimates that iterate to this
 OVERHEAD = 0.2e-3  # s, of a call over the bare launch
-
-VIEWS, ROWS, COLUMNS = 5, 19, 23
-GRID = clra.VolumeGrid(shape=(7, 11, 9), voxel_size=0.2)
-GEOMETRY = clra.circular(
-    VIEWS, source_to_axis=25.0, source_to_detector=50.0, pixel_size=0.3, shape=(ROWS, COLUMNS)
-)
-IMAGES = (VIEWS, ROWS, COLUMNS)
-RANDOM = np.random.default_rng(7)
-
-
-def values(*shape: int) -> np.ndarray:
-    return RANDOM.uniform(0.1, 1, shape).astype(np.float32)
-
-
-def radiographs() -> np.ndarray:
-    """Blobs that registration can hold on to."""
-    spectrum = np.fft.rfft2(RANDOM.normal(size=IMAGES))
-    v, u = np.fft.fftfreq(ROWS)[:, None], np.fft.rfftfreq(COLUMNS)
-    blurred = np.fft.irfft2(spectrum * np.exp(-60 * (u**2 + v**2)), s=(ROWS, COLUMNS))
-    return blurred.astype(np.float32)
-
-
-def normalised(coverage: Coverage) -> Callable[..., cl.Event]:
-    """Coverage divides a volume in place; copied afterwards, it looks like the others."""
-
-    def call(queue, out, volume, wait_for=None):
-        counted = coverage.compute(queue, wait_for)
-        divided = coverage.normalise(queue, volume, 2.0, wait_for=[counted])
-        return cl.enqueue_copy(
-            queue,
-            out.base_data,
-            volume.base_data,
-            byte_count=volume.nbytes,
-            src_offset=volume.offset,
-            dst_offset=out.offset,
-            wait_for=[divided],
-        )
-
-    return call
-
-
-@dataclass(frozen=True)
-class Case:
-    """An operator with its result's shape and its inputs."""
-
-    make: Callable[..., Any]
-    out: tuple[int, ...]
-    inputs: tuple[np.ndarray, ...]
-    run: Callable[[Any], Callable[..., cl.Event]] = lambda operator: operator
-    closeness: float = FORMS
-
-
-MOTION = np.array([[0.3, -0.4, 1.01]] * VIEWS, np.float32)
-PAIR = (radiographs(), radiographs())
-PAIR[1][:] += 4 * np.roll(PAIR[0], (0, -1), (1, 2))
-CASES = {
-    "forward": Case(
-        lambda c, **a: clra.ForwardProjector(c, GEOMETRY, GRID, **a),
-        IMAGES,
-        (values(*GRID.shape),),
-    ),
-    "back": Case(
-        lambda c, **a: clra.BackProjector(c, GEOMETRY, GRID, **a), GRID.shape, (values(*IMAGES),)
-    ),
-    "adjoint": Case(
-        lambda c, **a: clra.BackProjector(c, GEOMETRY, GRID, matched=True, **a),
-        GRID.shape,
-        (values(*IMAGES),),
-    ),
-    "ramp": Case(lambda c, **a: RampFilter(c, GEOMETRY, **a), IMAGES, (values(*IMAGES),)),
-    "coverage": Case(
-        lambda c, **a: Coverage(c, GEOMETRY, GRID, np.ones(ROWS), **a),
-        GRID.shape,
-        (values(*GRID.shape),),
-        normalised,
-    ),
-    "transform": Case(
-        lambda c, **a: RealFFT(c, IMAGES, **a),
-        IMAGES,
-        (values(*IMAGES), values(ROWS, COLUMNS // 2 + 1)),
-        lambda operator: operator.apply,
-    ),
-    "warp": Case(lambda c, **a: Warp(c, IMAGES[1:], **a), IMAGES, (values(*IMAGES), MOTION)),
-    "restrict images": Case(Restrict2D, (VIEWS, ROWS // 2, COLUMNS // 2), (values(*IMAGES),)),
-    "restrict": Case(Restrict3D, (2, ROWS // 2, COLUMNS // 2), (values(*IMAGES),)),
-    "prolong": Case(Prolong3D, IMAGES, (values(2, ROWS // 2, COLUMNS // 2),)),
-    "band-pass": Case(
-        lambda c, **a: Bandpass(c, IMAGES[1:], views=VIEWS, high_pass=4.0, **a),
-        IMAGES,
-        (values(*IMAGES),),
-    ),
-    "phase correlation": Case(
-        lambda c, **a: PhaseCorrelation(c, IMAGES[1:], views=3, **a),
-        (VIEWS, 2),
-        PAIR,
-        closeness=REGISTERED,
-    ),
-    "registration": Case(
-        lambda c, **a: Registration(c, IMAGES[1:], views=3, high_pass=4.0, **a),
-        (VIEWS, 10),
-        PAIR,
-        closeness=REGISTERED,
-    ),
-}
-WITH_SCRATCH = (
-    "forward",
-    "back",
-    "adjoint",
-    "ramp",
-    "coverage",
-    "warp",
-    "band-pass",
-    "phase correlation",
-    "registration",
-)
 
 
 @pytest.fixture(params=CASES)
 def case(request) -> Case:
     return CASES[request.param]
-
-
-def result(case: Case, operator: Any, queue: cl.CommandQueue) -> np.ndarray:
-    """Result of one call with arrays of the queue's context."""
-    inputs = [cl_array.to_device(queue, host) for host in case.inputs]
-    out = cl_array.empty(queue, case.out, np.float32)
-    event = case.run(operator)(queue, out, *inputs)
-    assert event.command_queue == queue
-    event.wait()
-    return out.get()
 
 
 _expected: dict[int, np.ndarray] = {}
@@ -198,13 +64,13 @@ def test_out_of_order_it_waits_for_what_it_is_told(case, context, expected):
     queue = cl.CommandQueue(context, properties=OUT_OF_ORDER)
     operator = case.make(context)
     for _ in range(2):  # the second call must not run into the first one's scratch
+        out = case.empty(queue)  # blocks, until all is done where PoCL is concerned
         late = cl.UserEvent(context)
         inputs = [cl_array.to_device(queue, np.full_like(host, np.nan)) for host in case.inputs]
         arrived = [
             cl.enqueue_copy(queue, array.base_data, host, wait_for=[late], is_blocking=False)
             for array, host in zip(inputs, case.inputs, strict=True)
         ]
-        out = cl_array.empty(queue, case.out, np.float32)
         timer = threading.Timer(0.03, late.set_status, [cl.command_execution_status.COMPLETE])
         timer.start()
         event = case.run(operator)(queue, out, *inputs, wait_for=arrived)
@@ -226,6 +92,7 @@ def test_arrays_with_an_offset(case, context, queue, expected):
         inputs.append(inside(host.shape)[1])
         inputs[-1].set(host)
     whole, out = inside(case.out)
+    out.fill(np.float32(case.before))
     case.run(case.make(context))(queue, out, *inputs).wait()
     np.testing.assert_array_equal(out.get(), expected)
     around = whole.get()
@@ -240,7 +107,7 @@ def test_a_foreign_buffer_wrapped_in_an_array(case, context, queue, expected):
         cl_array.Array(queue, host.shape, host.dtype, data=cl.Buffer.from_int_ptr(buffer.int_ptr))
         for host, buffer in zip(case.inputs, theirs, strict=True)
     ]
-    out = cl_array.empty(queue, case.out, np.float32)
+    out = case.empty(queue)
     case.run(case.make(context))(queue, out, *inputs).wait()
     np.testing.assert_array_equal(out.get(), expected)
 

@@ -1,0 +1,41 @@
+"""Every kernel, in its form for CPUs and its form for GPUs, on small odd shapes.
+
+Few and quick, so that they can be run under a checker such as Oclgrind, see tools/portability.py.
+"""
+
+import numpy as np
+import pytest
+from operator_cases import CASES, result
+
+from clra import kernels
+from clra.kernels.header import signatures
+from clra.ops import correlation, opencl
+from clra.ops.steps import Step
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_forms_for_cpu_and_gpu_agree(name, context, queue, monkeypatch):
+    # Phase correlation depends on what images are padded to, which is for the transform to choose.
+    monkeypatch.setattr(correlation, "fast_length", lambda context, length: 32)
+    case, found = CASES[name], []
+    for cpu in (True, False):
+        monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
+        found.append(result(case, case.make(context), queue))
+    assert np.isfinite(found[0]).all()
+    atol = case.closeness * np.abs(found[0]).max()
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=atol)
+
+
+def test_no_kernel_is_left_out(context, queue, monkeypatch):
+    launched, launch = set(), Step.__call__
+
+    def noted(step, *arguments, **named):
+        launched.add(step._kernel.function_name)
+        return launch(step, *arguments, **named)
+
+    monkeypatch.setattr(Step, "__call__", noted)
+    for cpu in (True, False):
+        monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
+        for case in CASES.values():
+            result(case, case.make(context), queue)
+    assert launched == {one.name for file in kernels.names() for one in signatures(file)}
