@@ -4,6 +4,7 @@ On a CPU device the buffers are host memory, and scipy's pocketfft is 7 to 70 ti
 OpenCL FFT kernels there.
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -12,7 +13,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.ops import opencl
-from clra.ops.fft_device import DeviceFFT
+from clra.ops.fft_device import DeviceFFT, NoPlanError
 from clra.ops.fft_host import HostFFT
 from clra.ops.scratch import Allocator
 
@@ -59,7 +60,8 @@ class RealFFT:
     axes : tuple of int
         ``(1, 2)`` for rows and columns, ``(2,)`` for columns only.
     backend : {"scipy", "reikna"}, optional
-        None: "scipy" on a CPU device, "reikna" elsewhere.
+        None: "scipy" on a CPU device, "reikna" elsewhere. Where reikna finds no work-group that a
+        device allows, a warning says so and scipy is used.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
@@ -94,13 +96,17 @@ class RealFFT:
         self._context = context
         self._multiplier_shape = self.spectrum_shape[3 - len(axes) :]
         self._backend: _Backend
-        if _backend(context, backend) == "scipy":
-            self.scratch_bytes = 0
-            self._backend = HostFFT(context, shape, tuple(axes))
-        else:
-            transform = DeviceFFT(context, shape, tuple(axes), allocator)
-            self.scratch_bytes = transform.scratch_bytes
-            self._backend = transform
+        self.scratch_bytes = 0
+        if _backend(context, backend) == "reikna":
+            try:
+                transform = DeviceFFT(context, shape, tuple(axes), allocator)
+            except NoPlanError as error:  # a device of small work-groups
+                warnings.warn(f"{error}: transforms run on the host, slowly", stacklevel=2)
+            else:
+                self.scratch_bytes = transform.scratch_bytes
+                self._backend = transform
+                return
+        self._backend = HostFFT(context, shape, tuple(axes))
 
     def forward(
         self,

@@ -13,6 +13,10 @@ from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step
 
 
+class NoPlanError(RuntimeError):
+    """reikna finds no work-groups for its kernels that the device allows."""
+
+
 class _Chain:
     """A reikna transform of one device, enqueued like any other kernel.
 
@@ -70,22 +74,29 @@ class DeviceFFT:
         n, self._rows, self._columns = shape
         self._width = self._columns if self._columns % 2 else self._columns // 2
         self._two_axes = len(axes) == 2
-        self._work = self._memory.empty((n, self._rows, self._width), np.complex64)
         self._spectrum_shape = (n, self._rows, self._columns // 2 + 1)
-        self.scratch_bytes = self._work.nbytes + 8 * math.prod(self._spectrum_shape)
-        planned: tuple[int, ...] = self._work.shape
+        work = (n, self._rows, self._width)
+        planned: tuple[int, ...] = work
         if self._width == 1 and self._two_axes:
             # reikna 0.9 fails on a last axis of one element behind one that is no power of two.
             planned, axes = planned[:2], (1,)
         transform = FFT(Type(np.complex64, planned), axes=axes)
 
         def plan(device: cl.Device) -> _Chain:
-            # reikna wants a queue to copy constants by, which is not used any more then.
-            return _Chain(transform.compile(ocl_api().Thread(cl.CommandQueue(context, device))))
+            # A queue to copy reikna's constants by, which is not used any more then.
+            thread = ocl_api().Thread(cl.CommandQueue(context, device))
+            try:
+                compiled = transform.compile(thread)
+            except ValueError as error:
+                raise NoPlanError(f"{device.name.strip()}: reikna: {error}") from None
+            thread.synchronize()
+            return _Chain(compiled)
 
         self._plan = plan
         first = opencl.device_of(context)
         self._plans = {first: plan(first)}
+        self._work = self._memory.empty(work, np.complex64)
+        self.scratch_bytes = self._work.nbytes + 8 * math.prod(self._spectrum_shape)
         self._spectrum: Array | None = None
         self._last: list[cl.Event] = []
 

@@ -154,3 +154,19 @@ def test_what_is_refused(context, queue):
         transform.forward(queue, spectrum, cl_array.zeros(queue, (3, 6, 10), np.float32))
     with pytest.raises(ValueError, match="spectrum_out: found shape"):
         transform.forward(queue, spectrum, image[:1])
+
+
+def test_where_reikna_finds_no_work_group_the_host_transforms(context, queue, monkeypatch):
+    def small(params, device):
+        ask(params, device)
+        params.max_work_group_size = 1
+
+    parameters = pytest.importorskip("reikna.cluda.ocl").DeviceParameters
+    ask = parameters.__init__
+    monkeypatch.setattr(parameters, "__init__", small)
+    with pytest.warns(UserWarning, match=r"reikna: Could not find .*: transforms run on the host"):
+        transform = RealFFT(context, (2, 3, 16), (2,), "reikna")
+    image = image_of((2, 3, 16))
+    spectrum = cl_array.empty(queue, (2, 3, 9), np.complex64)
+    transform.forward(queue, spectrum, cl_array.to_device(queue, image)).wait()
+    np.testing.assert_allclose(spectrum.get(), np.fft.rfft(image), rtol=0, atol=1e-5)
