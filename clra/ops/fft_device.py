@@ -87,7 +87,7 @@ class DeviceFFT:
             thread = ocl_api().Thread(cl.CommandQueue(context, device))
             try:
                 compiled = transform.compile(thread)
-            except ValueError as error:
+            except (ValueError, ZeroDivisionError) as error:  # as it meets small work-groups
                 raise NoPlanError(f"{device.name.strip()}: reikna: {error}") from None
             thread.synchronize()
             return _Chain(compiled)

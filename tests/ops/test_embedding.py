@@ -2,7 +2,6 @@
 
 import threading
 import time
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,7 +13,7 @@ import pyopencl.tools
 import pytest
 from operator_cases import CASES, WITH_SCRATCH, Case, result, values
 
-from clra.ops import opencl
+from clra.ops import fft, opencl
 from clra.ops.fft import RealFFT
 from clra.ops.pyramid import Restrict2D
 
@@ -163,9 +162,9 @@ def test_a_device_that_refuses_the_work_group(case, context, queue, expected, mo
 
     monkeypatch.setattr(cl.Kernel, "get_work_group_info", grudging)
     monkeypatch.setattr(opencl, "is_cpu", lambda device: False)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*reikna: Could not find")
-        found = result(case, case.make(context), queue)
+    # reikna's transforms see to their groups themselves, or leave it to the host.
+    monkeypatch.setattr(fft, "_backend", lambda *_: "scipy")
+    found = result(case, case.make(context), queue)
     atol = case.closeness * np.abs(expected).max()
     np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
 
