@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.app.slices import Slicer
 from clra.methods.fbp import ramp_fbp
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
@@ -73,6 +74,8 @@ class Comparison:
         Slices through the middle of the sample and a part of the horizontal one [1/mm].
     voxel_mm : float
         Edge of a pixel in them.
+    method : str
+        What reconstructed them, for reading.
     matches : tuple of Match
         Some views.
     pixel_mm : float
@@ -83,6 +86,7 @@ class Comparison:
     vertical: Pair
     detail: Pair
     voxel_mm: float
+    method: str
     matches: tuple[Match, ...]
     pixel_mm: float
 
@@ -103,21 +107,16 @@ def compare(
     confidence : ndarray, (views,)
         Of the estimate; the view with the least is shown.
     """
-    moved = scan.geometry.with_motion(motion)
-    radiographs = Radiographs(stream, scan, _level(scan, _SLICE_COLUMNS))
-    grid = _grid(scan.geometry, radiographs.level)
-    horizontal, vertical = (
-        Pair(*(_slice(stream, radiographs, g, plane) for g in (scan.geometry, moved)))
-        for plane in _middle_planes(grid)
-    )
+    slicer = Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS))
+    horizontal, vertical = (Pair(*slicer.images(plane)) for plane in _middle_planes(slicer.grid))
     level = _level(scan, _VOLUME_COLUMNS)
-    if level != radiographs.level:
-        radiographs = Radiographs(stream, scan, level)
+    radiographs = Radiographs(stream, scan, level)
     return Comparison(
         horizontal=horizontal,
         vertical=vertical,
         detail=_detail(horizontal),
-        voxel_mm=grid.voxel_size,
+        voxel_mm=slicer.grid.voxel_size,
+        method=slicer.method,
         matches=_matches(stream, radiographs, scan.geometry, motion, confidence),
         pixel_mm=_grid(scan.geometry, level).voxel_size,
     )
@@ -138,15 +137,6 @@ def _middle_planes(grid: VolumeGrid) -> tuple[VolumeGrid, VolumeGrid]:
     nz, _, nx = grid.shape
     along = VolumeGrid(shape=(nz, 1, nx), voxel_size=grid.voxel_size, centre=grid.centre)
     return grid.slab(nz // 2, nz // 2 + 1), along
-
-
-def _slice(
-    stream: Stream, radiographs: Radiographs, geometry: ConeBeamGeometry, plane: VolumeGrid
-) -> Image:
-    binned = geometry.binned(radiographs.level) if radiographs.level > 1 else geometry
-    volume = ramp_fbp(stream, radiographs, binned, plane, stage="report: slices").to_host()
-    # The top of the sample is at the top of the picture.
-    return np.ascontiguousarray(volume[0] if len(volume) == 1 else volume[::-1, 0])
 
 
 def _detail(pair: Pair) -> Pair:

@@ -91,18 +91,22 @@ def _points(axes: Any, x: Floats, y: Floats, colour: str, label: str | None = No
     )
 
 
-def _legend(axes: Any, **options: Any) -> None:
-    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.2,
-                handletextpad=0.3, columnspacing=1.2, markerscale=1.6, **options)  # fmt: skip
+def _legend(axes: Any) -> None:
+    legend = axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.2,
+                         handletextpad=0.3, columnspacing=1.2)  # fmt: skip
+    for handle in legend.legend_handles:  # the points of many views are too small to tell colours
+        handle.set_markersize(7)
 
 
-def corrections(motion: Motion) -> str:
+def corrections(motion: Motion, *, returns: bool = False) -> str:
     """Shift and magnification that undo the motion, against view number.
 
     Parameters
     ----------
     motion : Motion
         As estimated; its inverse is drawn, as in the paper's Figures 5 and 7.
+    returns : bool
+        Whether the stage came back after half of the views, which is then marked.
 
     Returns
     -------
@@ -125,6 +129,12 @@ def corrections(motion: Motion) -> str:
             right.set_ylim(0.999, 1.001)
         for axes in (left, right):
             axes.set_xlim(-0.5, motion.views - 0.5)
+            if returns:
+                middle = (motion.views - 1) / 2
+                axes.axvline(middle, color=INK, lw=0.8, ls="--")
+                axes.annotate("the stage returns", (middle, 1), (4, -2), ha="left", va="top",
+                              xycoords=axes.get_xaxis_transform(), textcoords="offset points",
+                              fontsize=8, color="#5b6875")  # fmt: skip
 
     return drawn(draw, (10.4, 3.5), "svg")
 

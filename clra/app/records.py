@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.app.describe import path_of
 from clra.io.motions import MotionFile, read_motion_file, write_motion_file
 from clra.io.scans import scan_checksum
 from clra.methods.results import AlignmentResult, Iteration
@@ -34,8 +35,8 @@ class Record:
     sigma : (float, float, float) or None
         Median standard errors of shift_u, shift_v [pixel] and magnification.
     about : mapping of str to str
-        Where it comes from: "scan", "checksum", "schedule", "estimate", "device", "command",
-        "version", as far as known.
+        Where it comes from: "scan", "checksum", "path" (the trajectory's kind), "schedule",
+        "estimate", "device", "command", "version", as far as known.
     """
 
     motion: Motion
@@ -78,6 +79,7 @@ class Record:
             about={
                 "scan": scan.name,
                 "checksum": scan_checksum(scan),
+                "path": path_of(scan.geometry).kind,
                 "schedule": result.schedule,
                 "device": result.device,
                 **_source_travel(result.motion, scan),

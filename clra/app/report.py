@@ -14,7 +14,6 @@ from clra.app.progress import duration
 from clra.app.records import Record
 from clra.io.atomic import atomic_path
 from clra.methods.results import Iteration
-from clra.model.motion import Motion
 
 if TYPE_CHECKING:
     from clra.app.comparison import Comparison, Match
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
 _WITHOUT_SCAN = (
     "Slices and re-projections need the scan: clra report MOTION.h5 --scan SCAN -o report.html"
 )
+_RETURNS = " Errors of the stage come mirrored about the dashed line, where it turns back."
 
 
 def write_report(path: str | os.PathLike[str], findings: Findings) -> None:
@@ -55,7 +55,7 @@ def render(findings: Findings) -> str:
     record = findings.record
     body = [
         page.cards(_cards(findings)),
-        _corrections(record.motion),
+        _corrections(record),
         *([_history(record.history)] if record.history else []),
         *([_errors(findings.errors)] if findings.errors else []),
         *_pictures(findings.comparison),
@@ -110,14 +110,16 @@ def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:
     return cards
 
 
-def _corrections(motion: Motion) -> str:
+def _corrections(record: Record) -> str:
+    returns = record.about.get("path") == "double helix"
     return page.section(
         "Correction of each radiograph",
         page.figure(
-            figures.corrections(motion),
+            figures.corrections(record.motion, returns=returns),
             "Shift (left) and magnification (right) that bring each measured radiograph back to "
             "where the ideal geometry puts it: the inverse of the estimated motion. Positive u is "
-            "toward higher columns, positive v toward higher rows; in pixels of the full panel.",
+            "toward higher columns, positive v toward higher rows; in pixels of the full panel."
+            + (_RETURNS if returns else ""),
             "Shift and magnification corrections against view number",
         ),
     )
@@ -189,7 +191,8 @@ def _pictures(comparison: "Comparison | None") -> list[str]:
                 [("Across the axis, before", flat.before, limits), ("After", flat.after, limits)],
                 comparison.voxel_mm,
             ),
-            f"Middle slice across the rotation axis. Mean squared gradient after alignment: "
+            f"Middle slice across the rotation axis, reconstructed by {comparison.method}. Mean "
+            f"squared gradient after alignment: "
             f"{flat.sharpening:.2f} times that before (noise counts as well as edges).",
             "Horizontal slices before and after alignment",
         ),
@@ -276,6 +279,8 @@ def _trust(record: Record) -> str:
 def _settings(findings: Findings) -> str:
     about = dict(findings.record.about)
     command = about.pop("command", None)
+    if findings.facts:
+        about.pop("path", None)  # they tell more of it
     about = {key: value for key, value in about.items() if value}
     facts = {name: value.replace(" um", " \u00b5m") for name, value in findings.facts.items()}
     tables = [page.facts(values) for values in (facts, about) if values]

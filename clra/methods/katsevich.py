@@ -28,6 +28,7 @@ def katsevich(
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
     *,
+    stage: str = "back-projecting",
     target: PlaneWriter | None = None,
 ) -> Volume:
     """Reconstruct exactly from helical radiographs.
@@ -48,6 +49,8 @@ def katsevich(
         pitch are free, and so is where on the panel the axis is seen.
     grid : VolumeGrid
         Where to reconstruct.
+    stage : str
+        What progress reports call this.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
 
@@ -91,7 +94,7 @@ def katsevich(
             for run in runs(seeing[index][number]):
                 for chunk in stream.chunks(run.stop - run.start, radiographs.view_bytes):
                     views = slice(run.start + chunk.start, run.start + chunk.stop)
-                    stream.report("back-projecting", done, total)
+                    stream.report(stage, done, total)
                     first = all_views.start + views.start
                     count = views.stop - views.start
                     # The filter makes one view from two.
@@ -112,7 +115,7 @@ def katsevich(
         else:
             volume.write_slab(index, attenuation, target)
         del attenuation  # before the next slab is made
-    stream.report("back-projecting", total, total)
+    stream.report(stage, total, total)
     return volume
 
 
@@ -152,7 +155,7 @@ def _refuse_short(helices: list[Helix], grid: VolumeGrid, radius: float) -> None
     planes = grid.shape[0]
     for helix in helices:
         low, high = np.moveaxis(pi_spans(helix, plane, radius), 2, 0)
-        if ((np.maximum(low, 0) < np.minimum(high, planes - 1)) & np.isfinite(low)).any():
+        if ((np.maximum(low, 0) <= np.minimum(high, planes - 1)) & np.isfinite(low)).any():
             return
     z = [end for helix in helices for end in (helix.z, helix.z + helix.views * helix.z_step)]
     raise ValueError(

@@ -12,9 +12,6 @@ from clra.model.phantom import Ellipsoids
 
 Floats = NDArray[np.float64]
 
-# Diameter of a fibre as a part of the core's: a beech fibre of 20 micrometres would be a 150th of
-# a core of 3 mm; this one survives a quarter of a resolution at which the core is 300 voxels wide.
-_FIBRE = 0.045
 # Lengths in diameters, the part of the radius that is wall, and the part of the fibres' room that
 # vessels take, which are so many times as wide.
 _LENGTHS, _WALL, _VESSELS, _WIDER = (5.0, 12.0), 0.4, 0.04, 1.9
@@ -23,7 +20,7 @@ _LENGTHS, _WALL, _VESSELS, _WIDER = (5.0, 12.0), 0.4, 0.04, 1.9
 _RAY_LENGTHS, _RAYS = (4.0, 9.0), 0.15
 
 
-def wood(radius: float, height: float, seed: int = 0) -> Ellipsoids:
+def wood(radius: float, height: float, seed: int = 0, *, fibre: float = 0.045) -> Ellipsoids:
     """Return a core of wood.
 
     Each cell is a spindle with a lumen: an ellipsoid that adds the wall's attenuation and one
@@ -36,10 +33,14 @@ def wood(radius: float, height: float, seed: int = 0) -> Ellipsoids:
         Of the cylinder, centred on the origin, that holds the cells [mm].
     seed : int
         Of the random numbers.
+    fibre : float
+        Diameter of a fibre as a part of the core's. Those of beech, 20 micrometres, would be a
+        150th of a core of 3 mm; the default survives a quarter of the resolution at which the core
+        is 300 voxels wide. The number of cells goes with its inverse cube.
     """
     radius, height = positive("radius", radius), positive("height", height)
     random = np.random.default_rng(seed)
-    width = 2 * radius * _FIBRE
+    width = 2 * radius * positive("fibre", fibre)
     cells = [_column(x, y, w, height, random) for x, y, w in _sites(radius, width, random)]
     rays = _rays(radius, height, width, random)
     outer = np.concatenate([*cells, rays])

@@ -46,7 +46,7 @@ def comparison() -> Comparison:
 
     measured = pair(41, 33)
     match = Match(11, "farthest moved", measured.before, measured.after, pair(41, 33))
-    return Comparison(pair(33, 33), pair(40, 33), pair(8, 8), 0.005, (match,), 0.01)
+    return Comparison(pair(33, 33), pair(40, 33), pair(8, 8), 0.005, "a method", (match,), 0.01)
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +75,7 @@ def test_the_page_tells_all_there_is(page, record):
         "Convergence",
         "Error of each view",
         "Before and after",
+        "reconstructed by a method",
         "re-projections",
         "translation x",
         "Flagged views: 3, 17",

@@ -1,0 +1,116 @@
+"""Slices of a scan without and with its motion corrected, by the best method for its trajectory."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.correction import corrected
+from clra.methods.fbp import ramp_fbp
+from clra.methods.katsevich import exact_helices, katsevich
+from clra.model.grid import VolumeGrid, default_grid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+from clra.ops.streaming import Radiographs, Stream
+
+Image = NDArray[np.float32]
+
+
+class Slicer:
+    """Reconstructs slices, before and after correction.
+
+    Katsevich's method where it can treat the scan, which then is corrected by resampling; else
+    ramp-filtered back-projection, with the motion absorbed into the geometry.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        As measured, at full resolution.
+    motion : Motion
+        Of its views.
+    level : int
+        Binning factor to reconstruct at.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+        Of the whole field of view at that level.
+    method : str
+        What it reconstructs by, for reading.
+    """
+
+    def __init__(self, stream: Stream, scan: Scan, motion: Motion, level: int) -> None:
+        whole = default_grid(scan.geometry)
+        self.grid = whole.binned(level) if level > 1 else whole
+        self._stream = stream
+        self._radiographs = Radiographs(stream, scan, level)
+        before, after = scan.geometry, scan.geometry.with_motion(motion)
+        self._geometries = [g.binned(level) if level > 1 else g for g in (before, after)]
+        try:
+            exact_helices(self._radiographs, self._geometries[0], self.grid)
+        except ValueError:
+            self.method = "ramp-filtered back-projection"
+            return
+        self.method = "Katsevich's method"
+        if level > 1:
+            scan = Scan(_Read(self._radiographs), self._geometries[0])
+        ideal = corrected(stream, scan, _at_level(motion, before.shape, level))
+        self._corrected = Radiographs(stream, ideal, 1)
+
+    def images(self, plane: VolumeGrid) -> tuple[Image, Image]:
+        """Reconstruct a slice before and after correction.
+
+        Parameters
+        ----------
+        plane : VolumeGrid
+            One plane of :attr:`grid`, or one row of it along y.
+
+        Returns
+        -------
+        ndarray, ndarray
+            float32 (y, x), or (z, x) with the top of the sample first [1/mm].
+        """
+        before, after = self._geometries
+        stream, stage = self._stream, "report: slices"
+        if self.method.startswith("ramp"):
+            volumes = [
+                ramp_fbp(stream, self._radiographs, geometry, plane, stage=stage)
+                for geometry in (before, after)
+            ]
+        else:
+            volumes = [
+                katsevich(stream, radiographs, before, plane, stage=stage)
+                for radiographs in (self._radiographs, self._corrected)
+            ]
+        without, corrected_one = (_upright(volume.to_host()) for volume in volumes)
+        return without, corrected_one
+
+
+def _upright(volume: Image) -> Image:
+    """Image of a volume of one plane or of one row."""
+    return np.ascontiguousarray(volume[0] if len(volume) == 1 else volume[::-1, 0])
+
+
+def _at_level(motion: Motion, panel: tuple[int, int], level: int) -> Motion:
+    """Motion in pixels of the binned panel, about whose centre it magnifies."""
+    # Rows and columns that binning drops move the centre by half as much.
+    aside_v, aside_u = (0.5 * (1 - motion.magnification) * (n % level) for n in panel)
+    return Motion(
+        shift_u=(motion.shift_u + aside_u) / level,
+        shift_v=(motion.shift_v + aside_v) / level,
+        magnification=motion.magnification,
+    )
+
+
+class _Read:
+    """Radiographs as the projections of a scan."""
+
+    def __init__(self, radiographs: Radiographs) -> None:
+        self.shape = radiographs.shape
+        self._radiographs = radiographs
+
+    def __getitem__(self, views: slice) -> NDArray[Any]:
+        start, stop, _ = views.indices(self.shape[0])
+        return self._radiographs.read(slice(start, stop))
