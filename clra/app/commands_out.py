@@ -21,6 +21,20 @@ def align(
     out: Annotated[
         Path, typer.Option("--output", "-o", metavar="MOTION.h5", help="Motion to write.")
     ],
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="ra|reference",
+            help="Re-projection alignment, or only the slow drift against a reference scan.",
+        ),
+    ] = "ra",
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="REF.nxs",
+            help="Reference scan: some views again, taken so quickly that nothing moved.",
+        ),
+    ] = None,
     schedule: Annotated[
         str,
         typer.Option(
@@ -56,6 +70,8 @@ def align(
     --------
       clra align scan.nxs -o motion.h5
       clra align scan.nxs -o motion.h5 --schedule 1QR-1HR --report report.html
+      clra align scan.nxs -o motion.h5 --reference quick.nxs
+      clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
     """
     from clra.app.errors import InterruptedCommandError
     from clra.app.findings import Errors, findings_of, summary_of
@@ -71,19 +87,23 @@ def align(
         if path is not None:
             ensure_writable(path)
     opened = reading.scan(scan)
+    still = None if reference is None else reading.scan(reference)
     about = {
         "file": str(scan.absolute()),
         "estimate": estimate,
-        "command": f"clra align {scan} -o {out} --schedule {schedule} --estimate {estimate} "
-        f"--gauge {gauge}{reading.as_typed()}",
+        "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
+        f"--estimate {estimate} --gauge {gauge}"
+        f"{'' if reference is None else f' --reference {reference}'}{reading.as_typed()}",
     }
     with console.progress() as progress:
         try:
             result = align_scan(
                 opened,
+                method=method,
                 schedule=schedule,
                 estimate=estimate,
                 gauge=gauge,
+                reference=still,
                 device=console.device,
                 progress=progress,
                 **limits,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clra.methods.acceleration import Anderson
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
+from clra.methods.reference import align_to_reference
 from clra.methods.refinement import refined_fbp
 from clra.methods.reprojection import Registered, registration_for, reproject_and_register
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
@@ -27,7 +28,7 @@ from clra.ops.streaming import Radiographs, Report, Stream
 
 Floats = NDArray[np.float64]
 
-METHODS = ("ra",)
+METHODS = ("ra", "reference")
 ESTIMATES = ("shift", "shift+scale", "source")
 GAUGES = ("anchored", "free")
 
@@ -44,6 +45,7 @@ def align(
     grid: VolumeGrid | None = None,
     device: Any = None,
     *,
+    reference: Scan | None = None,
     motion: Motion | None = None,
     truth: Motion | None = None,
     progress: Report | None = None,
@@ -58,8 +60,9 @@ def align(
     ----------
     scan : Scan
         At least two views.
-    method : {"ra"}
-        Re-projection alignment before reconstruction.
+    method : {"ra", "reference"}
+        Re-projection alignment before reconstruction; or the slow drift against a reference scan
+        alone, without any reconstruction.
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": a quarter of
         the resolution until converged (at most 6 iterations), then one at half.
@@ -71,8 +74,11 @@ def align(
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
         As :func:`clra.ops.opencl.choose_device` takes it.
+    reference : Scan, optional
+        Some views of the scan again, from the same places, taken so quickly that nothing moved.
+        What drifted slowly against them is where re-projection alignment starts.
     motion : Motion, optional
-        Where to start; by default no motion.
+        Where to start; by default no motion. What it has of the gauge stays.
     truth : Motion, optional
         To report errors against; by default the scan's own, if it is a simulated one.
     progress : callable, optional
@@ -105,6 +111,9 @@ def align(
        Algorithms 1 and 2.
     """
     _check(scan, method, estimate, gauge)
+    if (method == "reference" and reference is None) or (reference and motion):
+        found = "both" if motion else "none with method='reference'"
+        raise ValueError(f"reference, motion: found {found}, expected one of them")
     stages = parse_schedule(schedule)
     stream = Stream(
         device,
@@ -112,13 +121,19 @@ def align(
         max_host_memory=max_host_memory,
         report=progress,
     )
+    truth = truth or scan.truth
+    if reference is not None:
+        drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
+        if method == "reference":
+            return drift
+        motion = drift.motion
     grid = grid or default_grid(scan.geometry)
     grid = grid.padded(round(MARGIN * grid.shape[0]))
     scale, anchor = estimate != "shift", gauge == "anchored"
-    run = _Run(stream, scan, grid, schedule, scale, memory, anchor)
     start = motion or Motion.identity(scan.views)
-    run.motion = start.caused_by("source" if estimate == "source" else "panel")
-    run.truth = truth or scan.truth
+    start = start.caused_by("source" if estimate == "source" else "panel")
+    run = _Run(stream, scan, grid, schedule, scale, memory, anchor, start)
+    run.truth = truth
     try:
         for stage in stages:
             run.align_level(stage)
@@ -151,6 +166,7 @@ class _Run:
     scale: bool
     memory: int
     anchor: bool
+    start: Motion
     motion: Motion = field(init=False)
     truth: Motion | None = field(init=False, default=None)
     history: list[Iteration] = field(init=False, default_factory=list)
@@ -159,6 +175,7 @@ class _Run:
     weak: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.motion = self.start
         points = sample_points(self.grid)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
@@ -221,7 +238,7 @@ class _Run:
             volume,
             geometry,
             registration,
-            magnification=self.motion.magnification,
+            magnification=self.motion.magnification / self.start.magnification,
             lost=(self.scan.geometry.rows % level, self.scan.geometry.columns % level),
             stage=f"{title}: registering",
         )
@@ -232,9 +249,7 @@ class _Run:
         self.weak = outliers(found.correlation)
         self.found = from_neighbours(self.motion.then(found.motion), self.weak)
         here = self._as_lengths(self.motion)
-        there = self._as_lengths(
-            self.shift_gauge.anchored(self.found) if self.anchor else self.found
-        )
+        there = self._as_lengths(self._anchored(self.found) if self.anchor else self.found)
         moved = anderson.next(here, there - here)
         half = self._lever
         self.motion = Motion(
@@ -244,6 +259,22 @@ class _Run:
             cause=self.motion.cause,
         ).normalised()
         return np.asarray((there - here)[:2])
+
+    def _anchored(self, motion: Motion) -> Motion:
+        """Take the gauge out of what came to the start."""
+        start = self.start
+        came = self.shift_gauge.anchored(
+            Motion(
+                shift_u=motion.shift_u - start.shift_u,
+                shift_v=motion.shift_v - start.shift_v,
+                magnification=motion.magnification / start.magnification,
+            )
+        )
+        return Motion(
+            shift_u=start.shift_u + came.shift_u,
+            shift_v=start.shift_v + came.shift_v,
+            magnification=start.magnification * came.magnification,
+        )
 
     @property
     def _lever(self) -> float:
@@ -260,18 +291,7 @@ class _Run:
     def _errors(self) -> dict[str, float]:
         if self.truth is None:
             return {}
-        error = self.gauge.error(self.motion, self.truth)
-        return {
-            name: getattr(error, name)
-            for name in (
-                "mae_u",
-                "mae_v",
-                "mae_m",
-                "gauge_free_u",
-                "gauge_free_v",
-                "gauge_free_m",
-            )
-        }
+        return self.gauge.error(self.motion, self.truth).means()
 
     def result(self) -> AlignmentResult:
         """Return what the iterations so far gave."""

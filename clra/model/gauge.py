@@ -270,6 +270,11 @@ class MotionError:
     gauge_free_std_v: float
     gauge_free_std_m: float
 
+    def means(self) -> dict[str, float]:
+        """Return the mean absolute errors alone, by name."""
+        names = ("mae_u", "mae_v", "mae_m", "gauge_free_u", "gauge_free_v", "gauge_free_m")
+        return {name: getattr(self, name) for name in names}
+
 
 def motion_error(
     estimate: Motion,

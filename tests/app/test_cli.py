@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from clra.app import demo
+from clra.app.simulate import sample
 from clra.io.motions import write_motion_file
-from clra.io.scans import read_scan
+from clra.io.scans import read_scan, write_scan
 from clra.io.volumes import read_volume
 from clra.methods.results import AlignmentInterrupted
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
+from clra.model.scan import Scan
 
 COMMANDS = (
     "devices", "info", "import", "simulate", "align", "reconstruct", "correct", "report", "demo",
@@ -166,6 +168,21 @@ def test_info_tells_size_and_cost(clra, scan_file):
     told = json.loads(out)
     assert told["scan"]["views"] == 24 and told["levels"][0]["level"] == "FR"
     assert told["scan"]["path"]["kind"] == "space-filling"
+
+
+def test_align_to_a_reference_scan(clra, scan, scan_file, tmp_path):
+    still = scan.geometry
+    quick, motion = tmp_path / "quick.nxs", tmp_path / "drift.h5"
+    write_scan(quick, Scan(sample("spheres", still).line_integrals(still), still, name="quick"))
+    code, out, err = clra(
+        "align", scan_file, "-o", motion, "--method", "reference", "--reference", quick, "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["schedule"] == "reference"
+    with h5py.File(motion) as file:
+        assert "--method reference" in file.attrs["command"]
+        assert f"--reference {quick}" in file.attrs["command"]
+    refused(clra("align", scan_file, "-o", motion, "--method", "reference"), 2, "reference")
 
 
 def test_align_reconstruct_correct_report(clra, scan_file, tmp_path):
