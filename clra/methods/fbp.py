@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.visibility import runs, views_that_see
-from clra.ops.coverage import Coverage
+from clra.ops.coverage import Coverage, around
 from clra.ops.filtering import FADE, RampFilter, taper
 from clra.ops.projector import BackProjector
 from clra.ops.streaming import PlaneWriter, Radiographs, Stream, Volume
@@ -25,6 +25,7 @@ def ramp_fbp(
     believed: NDArray[np.bool_] | None = None,
     stage: str = "back-projecting",
     volumes: int = 1,
+    planes: slice | None = None,
     target: PlaneWriter | None = None,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
@@ -50,6 +51,8 @@ def ramp_fbp(
         What progress reports call this.
     volumes : int
         How many volumes like this one the device has to hold at a time.
+    planes : slice, optional
+        Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
 
@@ -68,9 +71,17 @@ def ramp_fbp(
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
     ramp = RampFilter(context, geometry, row_weight=row_weight, **memory)
     chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
-    coverage = Coverage(context, geometry.subset(chosen), grid, row_weight, allocator=stream.memory)
+    wanted = slice(0, grid.shape[0]) if planes is None else planes
+    near = around(wanted, grid.shape[0])
+    coverage = Coverage(
+        context,
+        geometry.subset(chosen),
+        grid.slab(near.start, near.stop),
+        row_weight,
+        allocator=stream.memory,
+    )
     coverage.compute(queue)
-    volume = Volume(stream, grid, volumes=volumes)
+    volume = Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
     slabs = volume.slabs
     seeing = [chosen & views_that_see(geometry, slab) for slab in slabs]
     total, done = sum(int(views.sum()) for views in seeing), 0
@@ -96,7 +107,7 @@ def ramp_fbp(
                     busy.pop(0)[0].wait()
                 del measured, filtered
                 done += views.stop - views.start
-        first = volume.planes[index].start
+        first = wanted.start - near.start + volume.planes[index].start
         coverage.normalise(queue, attenuation, math.pi, first=first, volume_order="yxz")
         if target is None:
             volume.put(index, attenuation)

@@ -22,6 +22,10 @@ from clra.ops.streaming import PlaneWriter, Radiographs, Stream, Volume
 _PROBED, _AT_BORDER = 24, 0.03
 
 
+# Views of each helix with the helix, and the radius of the field of view [mm].
+Exact = tuple[list[tuple[slice, Helix]], float]
+
+
 def katsevich(
     stream: Stream,
     radiographs: Radiographs,
@@ -29,6 +33,7 @@ def katsevich(
     grid: VolumeGrid,
     *,
     stage: str = "back-projecting",
+    fitted: Exact | None = None,
     target: PlaneWriter | None = None,
 ) -> Volume:
     """Reconstruct exactly from helical radiographs.
@@ -51,6 +56,8 @@ def katsevich(
         Where to reconstruct.
     stage : str
         What progress reports call this.
+    fitted : optional
+        What :func:`exact_helices` found, if it has been asked already.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
 
@@ -73,10 +80,10 @@ def katsevich(
     .. [2] F. Noo, J. Pack, D. Heuscher, "Exact helical reconstruction using native cone-beam
        geometries", Phys. Med. Biol. 48, 3787 (2003).
     """
-    fitted, radius = exact_helices(radiographs, geometry, grid)
+    helical, radius = fitted or exact_helices(radiographs, geometry, grid)
     # Steps 1 to 4: derivative, to kappa lines, Hilbert transform, back to rows.
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
-    filters = [KatsevichFilter(stream.context, helix, radius, **memory) for _, helix in fitted]
+    filters = [KatsevichFilter(stream.context, helix, radius, **memory) for _, helix in helical]
     helices = [one.helix for one in filters]
     volume = Volume(stream, grid)
     seeing = [
@@ -87,7 +94,7 @@ def katsevich(
         nz, ny, nx = slab.shape
         attenuation = stream.empty((ny, nx, nz))
         attenuation.fill(np.float32(0), queue=stream.queue)
-        for number, (all_views, _) in enumerate(fitted):
+        for number, (all_views, _) in enumerate(helical):
             # Step 5: back-projection over pi-intervals.
             back = PiBackProjector(stream.context, helices, number, slab, radius, **memory)
             busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
@@ -119,9 +126,7 @@ def katsevich(
     return volume
 
 
-def exact_helices(
-    radiographs: Radiographs, geometry: ConeBeamGeometry, grid: VolumeGrid
-) -> tuple[list[tuple[slice, Helix]], float]:
+def exact_helices(radiographs: Radiographs, geometry: ConeBeamGeometry, grid: VolumeGrid) -> Exact:
     """Find the helices of a scan, and refuse what :func:`katsevich` cannot treat.
 
     Parameters

@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 from clra.methods.alignment import align as align_scan
 from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
-from clra.methods.katsevich import exact_helices, katsevich
+from clra.methods.katsevich import Exact, exact_helices, katsevich
+from clra.methods.sharing import on_devices
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
+from clra.ops.opencl import choose_devices
 from clra.ops.streaming import HostPlanes, PlaneWriter, Radiographs, Report, Stream
 
 METHODS = ("fbp", "katsevich")
@@ -47,7 +49,8 @@ def reconstruct(
     align : bool
         Estimate the motion first, with the defaults of :func:`clra.align`.
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
+        As :func:`clra.ops.opencl.choose_device` takes it, or "all" to share the work out to all
+        devices of the best kind; alignment takes the first of them.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
@@ -113,27 +116,33 @@ def reconstruct_into(
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
-    stream = Stream(
-        device,
-        max_device_memory=max_device_memory,
-        max_host_memory=max_host_memory,
-        report=progress,
-    )
     grid = grid or default_grid(scan.geometry)
-    if method == "katsevich" and align:
-        # What it cannot treat it refuses before the long work.
-        exact_helices(Radiographs(stream, scan, 1), scan.geometry, grid)
-    if align:
-        motion = align_scan(
-            scan,
-            device=device,
-            progress=progress,
-            max_device_memory=max_device_memory,
-            max_host_memory=max_host_memory,
-        ).motion
+    devices = choose_devices(device)
+    limits: dict[str, Any] = {
+        "max_device_memory": max_device_memory,
+        "max_host_memory": max_host_memory,
+    }
+    fitted: Exact | None = None
     if method == "katsevich":
-        ideal = scan if motion is None else corrected(stream, scan, motion)
-        katsevich(stream, Radiographs(stream, ideal, 1), scan.geometry, grid, target=target)
+        # What it cannot treat it refuses before the long work.
+        stream = Stream(devices[0], **limits)
+        fitted = exact_helices(Radiographs(stream, scan, 1), scan.geometry, grid)
+    if align:
+        motion = align_scan(scan, device=devices[0], progress=progress, **limits).motion
+
+    def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
+        if method == "katsevich":
+            ideal = scan if motion is None else corrected(stream, scan, motion)
+            radiographs = Radiographs(stream, ideal, 1)
+            part = grid.slab(planes.start, planes.stop)
+            katsevich(stream, radiographs, scan.geometry, part, fitted=fitted, target=target)
+        else:
+            geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
+            radiographs = Radiographs(stream, scan, 1)
+            ramp_fbp(stream, radiographs, geometry, grid, planes=planes, target=target)
+
+    if len(devices) == 1:
+        stream = Stream(devices[0], report=progress, **limits)
+        work(stream, slice(0, grid.shape[0]), target)
     else:
-        geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
-        ramp_fbp(stream, Radiographs(stream, scan, 1), geometry, grid, target=target)
+        on_devices(devices, work, grid.shape[0], target, progress=progress, **limits)

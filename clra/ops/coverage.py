@@ -26,6 +26,12 @@ _BLIND = 0.02
 _HEIGHTS = 256
 
 
+def around(planes: slice, of: int) -> slice:
+    """Planes of a grid on which W is the same at `planes` as on the whole grid of `of` planes."""
+    low = max(0, planes.start // _ALONG - 1) * _ALONG
+    return slice(low, min(of, (-(-planes.stop // _ALONG) + 1) * _ALONG))
+
+
 class Coverage:
     """W(x): the sum, over the views that see x, of the weight of the row that x falls on.
 

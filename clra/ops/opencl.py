@@ -151,6 +151,34 @@ def choose_device(device: str | cl.Device | None = None) -> cl.Device:
     )
 
 
+def choose_devices(device: str | cl.Device | None = None) -> list[cl.Device]:
+    """Select the devices that share some work.
+
+    Parameters
+    ----------
+    device : str or cl.Device, optional
+        "all": the default device and those of its kind and platform. Else as
+        :func:`choose_device` takes it, which selects one.
+
+    Returns
+    -------
+    list of cl.Device
+
+    Raises
+    ------
+    NoDeviceError
+        As :func:`choose_device` does.
+    """
+    if device != "all":
+        return [choose_device(device)]
+    first = choose_device()
+    return [
+        other
+        for _, other in _all_devices()
+        if other.platform == first.platform and _kind(other) == _kind(first)
+    ]
+
+
 def _numbers(version: str) -> list[int]:
     """Numbers in a version, so that 10.0 is newer than 3.1."""
     return [int(number) for number in re.findall(r"\d+", version)]
