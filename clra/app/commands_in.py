@@ -50,7 +50,8 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
       clra info scan.nxs --json
     """
     from clra.app.describe import Facts, table
-    from clra.app.estimate import Speed, costs_of, costs_table, measure
+    from clra.app.estimate import costs_of, costs_table
+    from clra.app.speed import Speed, measure
     from clra.ops.opencl import NoDeviceError
 
     limits = memory.limits()

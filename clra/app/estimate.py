@@ -1,58 +1,20 @@
 """What aligning and reconstructing a scan will take: memory, and time on a device."""
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from clra.app.progress import duration
+from clra.app.speed import Speed, exact_updates, views_a_voxel
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.schedule import level_name
 
 if TYPE_CHECKING:
     from clra.methods.needs import Need
-    from clra.ops.memory import Budgets
-    from clra.ops.streaming import Report
 
 LEVELS = (1, 2, 4)
-# Size of the test: views, and the most columns of a radiograph. It takes about a second on two
-# cores; with half of the columns launching counts and the estimate is a third too long.
-_TEST_VIEWS, _TEST_COLUMNS = 48, 160
-# Heights at which the views that see the axis are counted.
-_HEIGHTS = 64
-
-
-@dataclass(frozen=True)
-class Speed:
-    """Seconds that a device takes for a unit of each kind of work.
-
-    Attributes
-    ----------
-    device : str
-        Its name.
-    budgets : Budgets or None
-        Memory that may be used on it and on the host.
-    back, forward : float
-        To back-project, and to project forward, one voxel in one view [s].
-    filtering, registering : float
-        To filter, and to register, one pixel [s].
-    """
-
-    device: str
-    budgets: "Budgets | None"
-    back: float
-    forward: float
-    filtering: float
-    registering: float
-
-    @classmethod
-    def unknown(cls) -> "Speed":
-        """Return the speed of no device."""
-        return cls("no device", None, *[math.nan] * 4)
 
 
 @dataclass(frozen=True)
@@ -73,7 +35,9 @@ class Cost:
         Voxels times the views that see them.
     reconstruction_s, iteration_s : float
         Time of a reconstruction, and of an iteration of alignment, without reading the scan.
-    reconstruction, iteration : Need or None
+    exact_s : float
+        Time of Katsevich's method; not a number where it cannot treat the scan.
+    reconstruction, iteration, exact : Need or None
         Memory that they take at their peaks, where there is a device.
     """
 
@@ -85,8 +49,10 @@ class Cost:
     voxel_views: float
     reconstruction_s: float
     iteration_s: float
+    exact_s: float
     reconstruction: "Need | None" = None
     iteration: "Need | None" = None
+    exact: "Need | None" = None
 
 
 def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
@@ -100,7 +66,7 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
         Of the device, from :func:`measure`.
     """
     whole = default_grid(geometry)
-    seen = _views_a_voxel(geometry, whole)
+    seen = views_a_voxel(geometry, whole)
     costs = []
     for level in LEVELS:
         if level > min(*geometry.shape, *whole.shape):
@@ -110,7 +76,7 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
         pixels = geometry.views * rows * columns
         updates = nz * ny * nx * seen
         reconstruction = updates * speed.back + pixels * speed.filtering
-        registration = updates * speed.forward + pixels * speed.registering
+        projection = updates * speed.forward
         costs.append(
             Cost(
                 level=level_name(level),
@@ -120,7 +86,10 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
                 volume_bytes=4 * nz * ny * nx,
                 voxel_views=updates,
                 reconstruction_s=reconstruction,
-                iteration_s=reconstruction + registration,
+                # Reconstructed, and corrected by what its re-projections lack.
+                iteration_s=2 * (reconstruction + projection) + pixels * speed.registering,
+                exact_s=exact_updates(geometry, whole) / level**3 * speed.exact_back
+                + pixels * speed.exact_filtering,
                 **_needs(speed, geometry, whole, level),
             )
         )
@@ -135,89 +104,13 @@ def _needs(
     from clra.methods.needs import alignment_need, reconstruction_need
 
     binned = (geometry.binned(level), grid.binned(level)) if level > 1 else (geometry, grid)
-    return {
+    needs = {
         "reconstruction": reconstruction_need(speed.budgets, *binned),
         "iteration": alignment_need(speed.budgets, geometry, grid, level),
     }
-
-
-def _views_a_voxel(geometry: ConeBeamGeometry, grid: VolumeGrid) -> float:
-    """Count the views that see a voxel, on average over the axis."""
-    _, _, z = grid.coordinates()
-    heights = np.linspace(z[0], z[-1], _HEIGHTS)
-    axis = np.column_stack([np.zeros((_HEIGHTS, 2)), heights])
-    row = geometry.project(axis)[..., 1]
-    return float(np.sum((row >= 0) & (row <= geometry.rows - 1)) / _HEIGHTS)
-
-
-def measure(
-    geometry: ConeBeamGeometry,
-    device: Any = None,
-    report: "Report | None" = None,
-    *,
-    max_device_memory: int | None = None,
-    max_host_memory: int | None = None,
-) -> Speed:
-    """Measure the speed of a device on a small piece of work like that of a scan.
-
-    Parameters
-    ----------
-    geometry : ConeBeamGeometry
-        Of the scan.
-    device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
-    report : callable, optional
-        Told how far the test is.
-    max_device_memory, max_host_memory : int, optional
-        Bytes that the work may use; the test itself is small.
-
-    Returns
-    -------
-    Speed
-        The first run of each operation, which builds its kernels, is not counted.
-    """
-    from clra.ops.filtering import RampFilter
-    from clra.ops.memory import Budgets
-    from clra.ops.projector import BackProjector, ForwardProjector
-    from clra.ops.registration import ESTIMATE_FIELDS, Registration
-    from clra.ops.streaming import Stream
-
-    stream = Stream(device, report=report)
-    context, queue = stream.context, stream.queue
-    level = -(-geometry.columns // _TEST_COLUMNS)
-    chosen = np.unique(np.linspace(0, geometry.views - 1, _TEST_VIEWS).astype(int))
-    small = geometry.subset(chosen)
-    small = small.binned(min(level, *small.shape)) if level > 1 else small
-    grid = default_grid(small)
-    nz, ny, nx = grid.shape
-    shape = (small.views, *small.shape)
-    # Something to register: the same smooth pattern in every radiograph.
-    row, column = np.ogrid[: shape[1], : shape[2]]
-    pattern = np.sin(row / 5.0) * np.cos(column / 7.0) + np.sin((row + column) / 11.0)
-    radiographs = stream.upload(np.tile(pattern.astype(np.float32), (shape[0], 1, 1)))
-    filtered, volume = stream.empty(shape), stream.empty((ny, nx, nz))
-    estimates = stream.empty((shape[0], len(ESTIMATE_FIELDS)))
-    ramp = RampFilter(context, small)
-    back = BackProjector(context, small, grid, volume_order="yxz")
-    forward = ForwardProjector(context, small, grid, volume_order="yxz")
-    register = Registration(context, small.shape, views=small.views)
-    updates = float(np.prod(grid.shape)) * _views_a_voxel(small, grid)
-    pixels = float(np.prod(shape))
-    work: Sequence[tuple[str, Callable[[], Any], float]] = (
-        ("filtering", lambda: ramp(queue, filtered, radiographs), pixels),
-        ("back", lambda: back(queue, volume, filtered), updates),
-        ("forward", lambda: forward(queue, filtered, volume), updates),
-        ("registering", lambda: register(queue, estimates, radiographs, radiographs), pixels),
-    )
-    seconds = {}
-    for step, (name, run, amount) in enumerate(work):
-        stream.report("testing the device", step, len(work))
-        run().wait()
-        started = time.perf_counter()
-        run().wait()
-        seconds[name] = (time.perf_counter() - started) / amount
-    budgets = Budgets.of(stream.device, max_device_memory, max_host_memory)
-    return Speed(stream.device.name.strip(), budgets, **seconds)
+    if not math.isnan(speed.exact_back):
+        needs["exact"] = reconstruction_need(speed.budgets, *binned, lines=2)
+    return needs
 
 
 def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
@@ -230,7 +123,9 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
     speed : Speed
         What the times hold for.
     """
-    rows = [("level", "radiographs", "", "volume", "", "reconstruction", "iteration")]
+    helical = any(cost.exact_s > 0 for cost in costs)
+    head = ("level", "radiographs", "", "volume", "", "reconstruction", "iteration")
+    rows: list[tuple[str, ...]] = [head + ("katsevich",) * helical]
     for cost in costs:
         nz, ny, nx = cost.volume_shape
         rows.append(
@@ -242,6 +137,7 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
                 size(cost.volume_bytes),
                 duration(cost.reconstruction_s),
                 duration(cost.iteration_s),
+                *([duration(cost.exact_s)] if helical else []),
             )
         )
     lines = _columns(rows)
@@ -268,7 +164,11 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
 def _memory_rows(costs: Sequence[Cost]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("memory", "work", "device", "host", "temporary files")]
     for cost in costs:
-        for work, need in (("reconstruction", cost.reconstruction), ("iteration", cost.iteration)):
+        for work, need in (
+            ("reconstruction", cost.reconstruction),
+            ("iteration", cost.iteration),
+            ("katsevich", cost.exact),
+        ):
             if need is not None:
                 sizes = (size(need.device), size(need.host), size(need.disk))
                 rows.append((cost.level, work, *sizes))

@@ -51,7 +51,12 @@ class Need:
 
 
 def reconstruction_need(
-    budgets: Budgets, geometry: ConeBeamGeometry, grid: VolumeGrid, lines: int = 1
+    budgets: Budgets,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    lines: int = 1,
+    *,
+    volumes: int = 1,
 ) -> Need:
     """Return what filtered back-projection takes, from file to file.
 
@@ -65,6 +70,8 @@ def reconstruction_need(
         Of the volume.
     lines : int
         For Katsevich's method: lines that its filter makes of a row of a radiograph, about two.
+    volumes : int
+        How many volumes the device has to hold at a time.
     """
     views, (rows, columns), shared = geometry.views, geometry.shape, budgets.shared
     chunk = _chunk(budgets, geometry)
@@ -74,14 +81,14 @@ def reconstruction_need(
         filtering = max(filtering, lines * rows * padded)
     coarse = grid.shape[0] / 4 * grid.shape[1] / 8 * grid.shape[2] / 8
     device = (
-        _slab(budgets, grid)
+        _slab(budgets, grid, volumes)
         + _projecting(budgets, geometry, chunk)
         + filtering
         + int(4 * coarse)
         + 200 * views
         + (2 if shared else 4) * chunk
     )
-    piece = min(budgets.piece, _slab(budgets, grid))
+    piece = min(budgets.piece, _slab(budgets, grid, volumes))
     return Need(device, int(shared * device + _READING * chunk) + piece)
 
 
@@ -104,9 +111,10 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     grid = grid.binned(level) if level > 1 else grid
     shared, pixels = budgets.shared, int(np.prod(geometry.shape))
     kept = 4 * geometry.views * pixels if level > 1 else 0
-    slab, volume = _slab(budgets, grid), 4 * int(np.prod(grid.shape))
+    # The reconstruction and its correction, see `refined_fbp`.
+    slab, volume = _slab(budgets, grid, 2), 4 * int(np.prod(grid.shape))
     cut = slab < volume
-    arrays = [kept] + [volume] * cut
+    arrays = [kept] + [volume] * 2 * cut
     in_memory = disk = 0
     for size in arrays:
         if in_memory + size <= budgets.kept:
@@ -121,11 +129,14 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
         _projecting(budgets, geometry, chunk)
         + lined * (PAIR_BYTES * pairs + _WINDOW)
         + (1 if shared else 2) * chunk
-        + (0 if shared and cut and volume <= budgets.kept - kept else slab)
+        + (0 if shared and cut and 2 * volume <= budgets.kept - kept else slab)
     )
     reading = _chunk(budgets, full)
+    first = reconstruction_need(budgets, geometry, grid, volumes=2)
+    lacking = _projecting(budgets, geometry, chunk) + chunk
+    lacking += 0 if shared and cut and 2 * volume <= budgets.kept - kept else slab
     steps = (
-        reconstruction_need(budgets, geometry, grid),
+        Need(first.device + lacking, first.host + shared * lacking),
         Need(registering, int(shared * registering + _READING * chunk)),
         Need(0 if shared else reading, int(_READING * reading)),
     )
@@ -144,10 +155,10 @@ def _chunk(budgets: Budgets, geometry: ConeBeamGeometry) -> int:
     return view * -(-geometry.views // -(-geometry.views // most))
 
 
-def _slab(budgets: Budgets, grid: VolumeGrid) -> int:
+def _slab(budgets: Budgets, grid: VolumeGrid, volumes: int = 1) -> int:
     """Bytes of a slab, which are equal runs of all planes."""
     nz, ny, nx = grid.shape
-    most = max(1, budgets.slab // (4 * ny * nx))
+    most = max(1, budgets.slab // volumes // (4 * ny * nx))
     return 4 * ny * nx * -(-nz // -(-nz // most))
 
 

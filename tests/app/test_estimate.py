@@ -1,13 +1,19 @@
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from clra.app.estimate import Speed, costs_of, costs_table, measure, size
+from clra.app.estimate import costs_of, costs_table, size
 from clra.app.simulate import paper_like
+from clra.app.speed import Speed, measure
+from clra.methods.katsevich import katsevich
 from clra.model.grid import default_grid
+from clra.model.scan import Scan
+from clra.model.trajectory import double_helix
 from clra.ops import opencl
 from clra.ops.memory import Budgets
+from clra.ops.streaming import Radiographs, Stream
 
 SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
 
@@ -25,7 +31,8 @@ def test_costs_follow_from_shapes():
     assert full.voxel_views == pytest.approx(100 * voxels, rel=0.05)
     pixels = 100 * 64 * 48
     assert full.reconstruction_s == pytest.approx(full.voxel_views * 1e-9 + pixels * 1e-8)
-    assert full.iteration_s == pytest.approx(full.voxel_views * 3e-9 + pixels * 4e-8)
+    assert full.iteration_s == pytest.approx(full.voxel_views * 6e-9 + pixels * 5e-8)
+    assert np.isnan(full.exact_s)  # no helix
 
 
 def test_a_long_scan_sees_a_voxel_in_part_of_its_views():
@@ -58,3 +65,55 @@ def test_a_device_is_measured_in_a_moment():
     speed = measure(paper_like("helix", 200, (200, 128)))
     for seconds in (speed.back, speed.forward, speed.filtering, speed.registering):
         assert 1e-12 < seconds < 1e-4
+
+
+def _wood(scale):
+    """The paper's double helix of wood, or a smaller one."""
+    views, voxel = 7068 // scale, 0.139 * 2.8823 / 315.5
+    z_step = 5240 * voxel / views
+    return double_helix(
+        views,
+        angle_step=2 * np.pi * z_step / 3.4,
+        z_step=z_step,
+        source_to_axis=2.8823,
+        source_to_detector=315.5,
+        pixel_size=0.139 * scale,
+        shape=(3040 // scale, 3040 // scale),
+    )
+
+
+def test_the_papers_double_helix():
+    geometry, small = _wood(1), _wood(16)
+    speed = measure(geometry, max_host_memory=8 << 30)
+    full = costs_of(geometry, speed)[0]
+    assert geometry.views == 14136 and full.panel == (3040, 3040)
+    assert full.volume_shape == (5240, 2526, 2526)
+    assert full.radiograph_bytes == 4 * 14136 * 3040**2
+    for need in (full.reconstruction, full.iteration, full.exact):
+        assert need.host < 8 << 30
+        assert need.device < 4 << 30
+    # Two volumes and no radiographs: those are read again and again at full resolution.
+    assert full.iteration.disk >= 2 * full.volume_bytes
+    assert full.exact.disk == 0
+    text = costs_table([full], speed)
+    assert "487 GiB" in text and "125 GiB" in text and text.count("katsevich") == 2
+    # All sizes scaled alike, back-projection goes with the fourth power, apart from rounding.
+    back = [
+        cost.exact_s - cost.radiograph_bytes / 4 * speed.exact_filtering
+        for cost in (full, costs_of(small, speed)[0])
+    ]
+    assert back[0] / back[1] == pytest.approx(16**4, rel=0.1)
+
+
+def test_time_of_katsevich_is_what_it_takes():
+    geometry = _wood(24)
+    speed = measure(geometry)
+    scan = Scan(np.ones((geometry.views, *geometry.shape), np.float32), geometry)
+    # A sample as wide as that is refused, so its radiographs are dark at the sides.
+    scan.projections[:, :, :12] = scan.projections[:, :, -12:] = 0
+    stream, grid = Stream(), default_grid(geometry)
+    katsevich(stream, Radiographs(stream, scan, 1), geometry, grid)  # builds the kernels
+    started = time.perf_counter()
+    katsevich(stream, Radiographs(stream, scan, 1), geometry, grid)
+    seconds = time.perf_counter() - started
+    assert 0.3 < costs_of(geometry, speed)[0].exact_s / seconds < 3
