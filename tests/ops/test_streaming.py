@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import clra
+from clra.methods.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid
 from clra.ops import opencl
 from clra.ops.streaming import Radiographs, Stream, Volume
@@ -80,3 +81,21 @@ def test_full_resolution_is_read_where_needed():
     assert Counting.read == 0
     radiographs.read(slice(2, 4))
     assert Counting.read == 1
+
+
+@pytest.mark.parametrize("budget", [None, 40 << 10])
+def test_a_device_with_its_own_memory_gets_copies(budget, monkeypatch):
+    """As on a GPU: radiographs are copied on a queue beside the one that works on them."""
+    geometry = clra.circular(60, shape=(12, 16), **PANEL)
+    grid = VolumeGrid(shape=(9, 10, 11), voxel_size=0.5)
+    pixels = np.random.default_rng(2).random((60, 12, 16), np.float32)
+    volumes = []
+    for shared in (True, False):
+        monkeypatch.setattr(opencl, "is_cpu", lambda device, shared=shared: shared)
+        stream = Stream(max_device_memory=budget)
+        monkeypatch.undo()
+        assert stream.budgets.shared == shared
+        radiographs = Radiographs(stream, clra.Scan(pixels, geometry), 1)
+        volumes.append(ramp_fbp(stream, radiographs, geometry, grid).to_host())
+    assert np.array_equal(volumes[0] != 0, volumes[1] != 0)
+    assert np.allclose(*volumes, atol=1e-6 * np.abs(volumes[0]).max())
