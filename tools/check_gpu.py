@@ -40,9 +40,11 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "filtering.cl": (128, {"LANES": 2}),
     "forwardproject.cl": (256, {"LANES": 1, "BLOCK": 1}),
     "katsevich.cl": (32, {"LANES": 2}),
+    "multigrid.cl": (64, {}),
     "pibackproject.cl": (256, {"LANES": 1, "BLOCK": 1}),
     "pyramid.cl": (128, {"LANES": 2}),
     "registration.cl": (32, {"LANES": 2, "GROUP": 32}),
+    "transmission.cl": (64, {}),
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),
 }

@@ -7,17 +7,24 @@ ones come out in the frame of the measured ones, so that what registration finds
 """
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.acceleration import Anderson
+from clra.methods.imgr import imgr
+from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
 from clra.methods.reference import align_to_reference
 from clra.methods.refinement import refined_fbp
-from clra.methods.reprojection import Registered, registration_for, reproject_and_register
+from clra.methods.reprojection import (
+    Registered,
+    registration_for,
+    reproject_and_register,
+    with_margin,
+)
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
 from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import VolumeGrid, default_grid
@@ -28,13 +35,9 @@ from clra.ops.streaming import Radiographs, Report, Stream
 
 Floats = NDArray[np.float64]
 
-METHODS = ("ra", "reference")
+METHODS = ("ra", "imgr", "reference")
 ESTIMATES = ("shift", "shift+scale", "source")
 GAUGES = ("anchored", "free")
-
-# Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
-# past it, and what they see there has to be in the re-projection too.
-MARGIN = 0.15
 
 
 def align(
@@ -60,12 +63,14 @@ def align(
     ----------
     scan : Scan
         At least two views.
-    method : {"ra", "reference"}
-        Re-projection alignment before reconstruction; or the slow drift against a reference scan
-        alone, without any reconstruction.
+    method : {"ra", "imgr", "reference"}
+        Re-projection alignment before reconstruction; or within one by multigrid iteration
+        (:func:`clra.methods.imgr.imgr`, Algorithm 3), which returns the volume as well; or the slow
+        drift against a reference scan alone, without any reconstruction.
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": a quarter of
-        the resolution until converged (at most 6 iterations), then one at half.
+        the resolution until converged (at most 6 iterations), then one at half. For "imgr" the
+        levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
         source that moved, in all three directions: this explains the parallax by which what is
@@ -85,7 +90,7 @@ def align(
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     memory : int
         Iterations that Anderson acceleration looks back on within a level; 0 for the paper's plain
-        iteration.
+        iteration. "imgr" iterates plainly.
     gauge : {"anchored", "free"}
         What becomes of the part of the motion that a movement of the sample as a whole (three
         translations, two tilts, a stretch along z) would explain as well. The data hardly see it,
@@ -108,13 +113,13 @@ def align(
     References
     ----------
     .. [1] "Multi-resolution radiograph alignment for motion correction in X-ray micro-tomography",
-       Algorithms 1 and 2.
+       Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise ValueError(f"reference, motion: found {found}, expected one of them")
-    stages = parse_schedule(schedule)
+    stages = parse_schedule(schedule) if method == "ra" else ()
     stream = Stream(
         device,
         max_device_memory=max_device_memory,
@@ -128,11 +133,22 @@ def align(
             return drift
         motion = drift.motion
     grid = grid or default_grid(scan.geometry)
-    grid = grid.padded(round(MARGIN * grid.shape[0]))
     scale, anchor = estimate != "shift", gauge == "anchored"
     start = motion or Motion.identity(scan.views)
     start = start.caused_by("source" if estimate == "source" else "panel")
-    run = _Run(stream, scan, grid, schedule, scale, memory, anchor, start)
+    if method == "imgr":
+        return _by_imgr(
+            stream,
+            scan,
+            grid,
+            levels=schedule,
+            align=True,
+            scale=scale,
+            anchor=anchor,
+            motion=start,
+            truth=truth,
+        )
+    run = _Run(stream, scan, with_margin(grid), schedule, scale, memory, anchor, start)
     run.truth = truth
     try:
         for stage in stages:
@@ -142,6 +158,17 @@ def align(
             raise
         raise AlignmentInterrupted(run.result()) from None
     return run.result()
+
+
+def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:
+    """Algorithm 3."""
+    try:
+        found = imgr(stream, scan, grid, **options)
+    except ReconstructionInterrupted as stopped:
+        assert stopped.alignment is not None  # each level registers
+        raise AlignmentInterrupted(stopped.alignment) from None
+    assert found.alignment is not None
+    return replace(found.alignment, volume=found.volume.to_host())
 
 
 def _check(scan: Scan, method: str, estimate: str, gauge: str) -> None:
@@ -249,7 +276,9 @@ class _Run:
         self.weak = outliers(found.correlation)
         self.found = from_neighbours(self.motion.then(found.motion), self.weak)
         here = self._as_lengths(self.motion)
-        there = self._as_lengths(self._anchored(self.found) if self.anchor else self.found)
+        there = self._as_lengths(
+            self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
+        )
         moved = anderson.next(here, there - here)
         half = self._lever
         self.motion = Motion(
@@ -259,22 +288,6 @@ class _Run:
             cause=self.motion.cause,
         ).normalised()
         return np.asarray((there - here)[:2])
-
-    def _anchored(self, motion: Motion) -> Motion:
-        """Take the gauge out of what came to the start."""
-        start = self.start
-        came = self.shift_gauge.anchored(
-            Motion(
-                shift_u=motion.shift_u - start.shift_u,
-                shift_v=motion.shift_v - start.shift_v,
-                magnification=motion.magnification / start.magnification,
-            )
-        )
-        return Motion(
-            shift_u=start.shift_u + came.shift_u,
-            shift_v=start.shift_v + came.shift_v,
-            magnification=start.magnification * came.magnification,
-        )
 
     @property
     def _lever(self) -> float:

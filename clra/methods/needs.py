@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clra.methods.alignment import MARGIN
+from clra.methods.reprojection import with_margin
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.lines import line_stride
@@ -106,9 +106,8 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     level : int
         Binning: 1, 2 or 4.
     """
-    grid = grid.padded(round(MARGIN * grid.shape[0]))
     geometry = full.binned(level) if level > 1 else full
-    grid = grid.binned(level) if level > 1 else grid
+    grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
     shared, pixels = budgets.shared, int(np.prod(geometry.shape))
     kept = 4 * geometry.views * pixels if level > 1 else 0
     # The reconstruction and its correction, see `refined_fbp`.

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods import iterative
 from clra.methods.alignment import align as align_scan
 from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
@@ -16,7 +17,7 @@ from clra.model.scan import Scan
 from clra.ops.opencl import choose_devices
 from clra.ops.streaming import HostPlanes, PlaneWriter, Radiographs, Report, Stream
 
-METHODS = ("fbp", "katsevich")
+METHODS = ("fbp", "katsevich", *iterative.METHODS)
 
 
 def reconstruct(
@@ -30,6 +31,7 @@ def reconstruct(
     progress: Report | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    **options: Any,
 ) -> NDArray[np.float32]:
     """Reconstruct a volume.
 
@@ -37,25 +39,32 @@ def reconstruct(
     ----------
     scan : Scan
         Radiographs and their geometry.
-    method : {"fbp", "katsevich"}
-        Ramp-filtered back-projection, for any trajectory; or Katsevich's, which is exact, for
-        helices and double helices.
+    method : {"fbp", "katsevich", "osem-tr", "imgr"}
+        Ramp-filtered back-projection, for any trajectory; Katsevich's, which is exact, for helices
+        and double helices; ordered subsets for counted photons
+        (:func:`clra.methods.osem_tr.osem_tr`); or the paper's Algorithm 3, which solves the lowest
+        resolution by these and corrects the higher ones once (:func:`clra.methods.imgr.imgr`).
     grid : VolumeGrid, optional
         Where to reconstruct; by default the whole field of view
         (:func:`clra.model.grid.default_grid`).
     motion : Motion, optional
-        Of the radiographs. "fbp" absorbs it into the geometry, so that nothing is resampled;
+        Of the radiographs, absorbed into the geometry, so that nothing is resampled; but
         "katsevich" needs ideal rows and resamples each radiograph once.
     align : bool
-        Estimate the motion first, with the defaults of :func:`clra.align`.
+        Estimate the motion first, with the defaults of :func:`clra.align`; "imgr" does so on the
+        way.
     device : str or cl.Device, optional
         As :func:`clra.ops.opencl.choose_device` takes it, or "all" to share the work out to all
-        devices of the best kind; alignment takes the first of them.
+        devices of the best kind; alignment and iterative methods take the first of them.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used, see :class:`clra.ops.streaming.Stream`. The volume that is returned
         comes on top: :func:`reconstruct_into` takes one larger than the memory.
+    **options
+        Of "osem-tr" and "imgr": the fields of :class:`clra.methods.osem_tr.OrderedSubsets`
+        (subsets, passes, update, initial, i0, background); of "imgr" also levels and cycles, as
+        :func:`clra.methods.imgr.imgr` takes them.
 
     Returns
     -------
@@ -65,8 +74,9 @@ def reconstruct(
     Raises
     ------
     ValueError
-        If the method is unknown, both `motion` and `align` are given, or the scan is one that
-        Katsevich's method cannot treat; says what pitch, panel or field of view would do.
+        If the method or an option of it is unknown, both `motion` and `align` are given, or the
+        scan is one that Katsevich's method cannot treat; says what pitch, panel or field of view
+        would do.
     """
     planes = HostPlanes(grid or default_grid(scan.geometry))
     reconstruct_into(
@@ -80,6 +90,7 @@ def reconstruct(
         progress=progress,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
+        **options,
     )
     return planes.volume
 
@@ -96,6 +107,7 @@ def reconstruct_into(
     progress: Report | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    **options: Any,
 ) -> None:
     """Reconstruct a volume, and hand it on some planes at a time.
 
@@ -104,7 +116,7 @@ def reconstruct_into(
     target : PlaneWriter
         Takes the planes, each once; :func:`clra.io.volumes.open_volume` gives one that writes a
         file.
-    scan, method, grid, motion, align, device, progress, max_device_memory, max_host_memory
+    scan, method, grid, motion, align, device, progress, max_device_memory, max_host_memory, options
         As :func:`reconstruct` takes them.
 
     Raises
@@ -116,6 +128,7 @@ def reconstruct_into(
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
+    iterative.sorted_options(method, options)  # refuses what is wrong before the long work
     grid = grid or default_grid(scan.geometry)
     devices = choose_devices(device)
     limits: dict[str, Any] = {
@@ -127,8 +140,12 @@ def reconstruct_into(
         # What it cannot treat it refuses before the long work.
         stream = Stream(devices[0], **limits)
         fitted = exact_helices(Radiographs(stream, scan, 1), scan.geometry, grid)
-    if align:
+    if align and method != "imgr":
         motion = align_scan(scan, device=devices[0], progress=progress, **limits).motion
+    if method in iterative.METHODS:
+        stream = Stream(devices[0], report=progress, **limits)
+        iterative.iterate(stream, target, scan, method, grid, motion, align, options)
+        return
 
     def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
         if method == "katsevich":

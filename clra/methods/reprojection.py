@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.registration import ESTIMATE_FIELDS, Registration
@@ -16,6 +17,9 @@ from clra.ops.streaming import Radiographs, Stream, Volume
 
 Floats = NDArray[np.float64]
 
+# Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
+# past it, and what they see there has to be in the re-projection too.
+_MARGIN = 0.15
 # Expected standard deviation of log(magnification): the paper's scans stay within 1 +- 0.001. On
 # small panels a slow drift of the magnification along the scan is hardly seen: at twice the value
 # it ends 2e-3 off for 190 columns, at half of it half of what such panels do tell is lost.
@@ -45,6 +49,11 @@ class Registered:
     correlation: Floats
     residual: Floats
     sigma: Floats
+
+
+def with_margin(grid: VolumeGrid) -> VolumeGrid:
+    """Return a grid with planes added at both ends, for what views at the ends of a scan see."""
+    return grid.padded(round(_MARGIN * grid.shape[0]))
 
 
 def registration_for(

@@ -29,6 +29,8 @@ class Iteration:
         Time it took.
     mae_u, mae_v, mae_m, gauge_free_u, gauge_free_v, gauge_free_m : float or None
         Mean absolute errors after the iteration where the truth is known.
+    misfit : float or None
+        Of iterative reconstruction: mean Poisson deviance of a ray before the volume's update.
     """
 
     level: str
@@ -45,6 +47,7 @@ class Iteration:
     gauge_free_u: float | None = None
     gauge_free_v: float | None = None
     gauge_free_m: float | None = None
+    misfit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,8 @@ class AlignmentResult:
         Views whose registration is not believed; they have their neighbours' motion.
     schedule, device : str
         What was run, and on what.
+    volume : ndarray of float32, (nz, ny, nx), optional
+        Attenuation [1/mm], where the method reconstructs as it aligns.
     """
 
     motion: Motion
@@ -80,6 +85,7 @@ class AlignmentResult:
     flagged: tuple[int, ...]
     schedule: str
     device: str
+    volume: NDArray[np.float32] | None = None
 
 
 class AlignmentInterrupted(KeyboardInterrupt):

@@ -151,7 +151,7 @@ class Gauge:
             rms_by_mode=dict(zip(self.modes, alone.tolist(), strict=True)),
         )
 
-    def anchored(self, motion: Motion) -> Motion:
+    def anchored(self, motion: Motion, start: Motion | None = None) -> Motion:
         """Return the motion without its gauge.
 
         Parameters
@@ -159,11 +159,24 @@ class Gauge:
         motion : Motion
             Of the same views. The few that moved much farther than the others, or were registered
             wrongly, do not tell how the sample moved.
+        start : Motion, optional
+            Whose gauge stays: it is taken out of what came to this alone.
         """
-        fit = self.fit(motion)
+        start = start or Motion.identity(self.views)
+        came = Motion(
+            shift_u=motion.shift_u - start.shift_u,
+            shift_v=motion.shift_v - start.shift_v,
+            magnification=motion.magnification / start.magnification,
+        )
+        fit = self.fit(came)
         far = _far(fit.remainder[:, 0]) | _far(fit.remainder[:, 1])
-        rest = fit.remainder if not far.any() else self._remainder(motion, ~far)
-        return Motion(shift_u=rest[:, 0], shift_v=rest[:, 1], magnification=1 + rest[:, 2])
+        rest = fit.remainder if not far.any() else self._remainder(came, ~far)
+        return Motion(
+            shift_u=start.shift_u + rest[:, 0],
+            shift_v=start.shift_v + rest[:, 1],
+            magnification=start.magnification * (1 + rest[:, 2]),
+            cause=motion.cause,
+        )
 
     def _remainder(self, motion: Motion, chosen: NDArray[np.bool_]) -> Floats:
         """Return what is left of a motion, (views, 3), if the modes are fitted to some views."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,6 +54,36 @@ def level_name(level: int) -> str:
         if factor == level:
             return name
     raise ValueError(f"level: found {level}, expected one of {tuple(_LEVELS.values())}")
+
+
+def parse_levels(text: str) -> tuple[int, ...]:
+    """Read the levels of a multigrid cycle.
+
+    Parameters
+    ----------
+    text : str
+        Resolutions that double up to full, such as "QR-HR-FR" or "ER-QR-HR-FR"; or "auto": the
+        former.
+
+    Returns
+    -------
+    tuple of int
+        Binning factors, ending with 1.
+
+    Raises
+    ------
+    ValueError
+        If the text is no such cycle.
+    """
+    if text == "auto":
+        text = "QR-HR-FR"
+    factors = tuple(_LEVELS.get(name, 0) for name in str(text).upper().split("-"))
+    if factors[-1] != 1 or any(a != 2 * b for a, b in pairwise(factors)):
+        raise ValueError(
+            f"levels: found {text!r}, expected resolutions that double up to full, such as "
+            "'QR-HR-FR' or 'ER-QR-HR-FR'"
+        )
+    return factors
 
 
 def parse_schedule(text: str) -> tuple[Stage, ...]:

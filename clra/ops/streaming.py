@@ -297,7 +297,15 @@ class Radiographs:
         self.shape = (views, rows // level, columns // level)
         self.level = level
         self._stream, self._scan = stream, scan
-        self._kept = None if level == 1 else self._read_all()
+        self._kept: Store | None = None if level == 1 else self._read_all()
+
+    @classmethod
+    def of(cls, kept: Store, level: int) -> "Radiographs":
+        """Radiographs (views, rows, columns) of a level that are known already."""
+        known = cls.__new__(cls)
+        views, rows, columns = kept.shape
+        known.shape, known.level, known._kept = (views, rows, columns), level, kept
+        return known
 
     @property
     def view_bytes(self) -> int:
