@@ -2,20 +2,21 @@
 // volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
 // bilinearly at the voxel's shadow.
 //
-// chi is 1 inside the Tam-Danielsson window, whose borders `window` gives by column, 0 outside. At a
-// border it falls linearly over as much as the shadow moves from view to view, so that a voxel's
+// chi is 1 inside the Tam-Danielsson window, whose borders `window` gives by column, 0 outside. At
+// a border it falls linearly over as much as the shadow moves from view to view, so that a voxel's
 // first and last view count by the part of them that belongs to its pi-interval, and one row more,
 // over which p is interpolated.
 //
 // weight shares voxels among helices. Of each, `spans` gives the heights above each (x, y) whose
-// pi-interval it holds; towards their ends its part falls linearly over BLEND voxels. Voxels that no
-// helix holds become 0.
+// pi-interval it holds; towards their ends its part falls linearly over BLEND voxels. Voxels that
+// no helix holds become 0.
 //
 // v is parallel to z: the voxels of a column share g and the detector column, and row is linear in
 // z. A work-item sums BLOCK voxels along z over the given views. Global sizes are
 // (blocks, strip, ny ceil(nx / strip)), rounded up at will.
 
 #include "geometry.clh"
+#include "pieces.clh"
 
 #ifndef BLOCK
 #define BLOCK (LANES == 1 ? 1 : 32 * LANES) // whole LANES
@@ -30,7 +31,8 @@ static inline float part(global const float *span, const float z)
     return clamp(SMALLER(z - span[0], span[1] - z) * (1.0f / BLEND), 0.0f, 1.0f);
 }
 
-// 0 to 1: how far inside the window, whose borders are softened by a half width of 1 / (2 per_width)
+// 0 to 1: how far inside the window, whose borders are softened by a half width of 1 / (2
+// per_width)
 static inline real inside(const real row, const float low, const float high, const float per_width)
 {
     const real from_low = clamp((row - low) * per_width + 0.5f, (real)(0.0f), (real)(1.0f));
@@ -115,15 +117,14 @@ kernel void pi_backproject(
         global const float *next = line + pitch;
         const float next_weight = f * scale;
         const float line_weight = scale - next_weight;
-#if LANES == 8
+#if LANES > 1
         if (fabs(slope) * (LANES - 1) <= SPAN) {
             steps step = steps_from(fma(slope, (float)start, row), slope);
             for (int k = start; k < stop; k += LANES) {
                 const int base = step_base(step);
-                const int8 at = step_lanes(step);
-                const float16 blend = line_weight * load_window(line + base) +
-                                      next_weight * load_window(next + base);
-                float8 value = between(blend, whole_part(at), fraction(at));
+                const whole at = step_lanes(step);
+                const piece both = blend(line_weight, line + base, next_weight, next + base);
+                real value = between(both, whole_part(at), fraction(at));
                 if (k < lowest + soft || k + (LANES - 1) > highest - soft)
                     value *= inside(slope * ((float)k + RAMP) + row, low, high, per_width);
                 store_lanes(load_lanes(sum + k) + value, sum + k);

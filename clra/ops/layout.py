@@ -21,6 +21,7 @@ from clra.ops.transpose import Planes, Transpose
 VOLUME_ORDERS = ("zyx", "yxz")
 
 _PAD = 24  # as in geometry.clh
+_PIECE = 32  # the most that kernels read from where they are, past the last line's end
 
 # Projections that one launch treats. They have to stay in the last cache of a CPU, and few launches
 # have to read and write the volume.
@@ -42,8 +43,8 @@ class Layout:
         Of the volume.
     volume_order : {"zyx", "yxz"}
         Order of the caller's volume.
-    lanes : {1, 8}, optional
-        Form of the kernels, the one for the device by default; the other serves tests.
+    lanes : {1, 8, 16}, optional
+        Form of the kernels, the one for the device by default; the others serve tests.
     tilted : bool
         Treat axial views as tilted ones; serves tests.
     allocator : callable, optional
@@ -57,6 +58,8 @@ class Layout:
         As above.
     columnar : bool
         Whether the kernels for columns apply, to a CPU and v parallel to z.
+    steep : bool
+        Whether rays may advance fastest along z.
     table : Array
         (views, 24), see geometry.clh.
     sizes : tuple of int
@@ -86,7 +89,7 @@ class Layout:
         cpu = opencl.is_cpu(opencl.device_of(context))
         self.context = context
         self.grid = grid
-        self.lanes = lanes or (8 if cpu else 1)
+        self.lanes = lanes or _best_lanes(opencl.device_of(context))
         self.sizes = grid.shape[::-1]
         self.panel = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
         self.last: list[cl.Event] = []
@@ -98,11 +101,12 @@ class Layout:
         )
         self._bytes = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
         self._least = _LEAST_VIEWS if scratch_limit is None else 1
-        self._transpose = Transpose(context, self.lanes)
+        self._transpose = Transpose(context, min(self.lanes, 8))
         self._lines: Array | None = None
         self._volume: Array | None = None
         self._memory = Scratch(context, allocator)
-        self.scratch_bytes = 4 * min(geometry.views, self._most) * self._view_elements
+        lines = min(geometry.views, self._most) * self._view_elements
+        self.scratch_bytes = 4 * (lines + _PIECE)
         if volume_order == "zyx":
             self.scratch_bytes += 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
         self.set_geometry(geometry)
@@ -117,6 +121,7 @@ class Layout:
             )
         self.table = to_device(self.context, view_table(geometry, self.grid))
         self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
+        self.steep = not geometry.axial and _steep(geometry)
 
     def check(
         self,
@@ -193,7 +198,9 @@ class Layout:
         """Lines of `count` views, (count, columns + 1, pitch)."""
         columns, _, pitch = self.panel
         if self._lines is None or len(self._lines) < count:
-            self._lines = self._memory.empty((count, columns + 1, pitch))
+            size = count * (columns + 1) * pitch
+            flat = self._memory.empty((size + _PIECE,))
+            self._lines = flat[:size].reshape(count, columns + 1, pitch)
         lines: Array = self._lines[:count]
         return lines
 
@@ -237,6 +244,29 @@ class Layout:
             nx, ny, nz = self.sizes
             self._volume = self._memory.empty((ny, nx, nz))
         return self._volume
+
+
+def _steep(geometry: ConeBeamGeometry) -> bool:
+    """Whether any ray may advance faster along z than along x and y."""
+    across, down = (0.5 * (n - 1) for n in (geometry.columns, geometry.rows))
+    centre = geometry.detector - geometry.source
+    corners = np.stack(
+        [centre + a * across * geometry.u + b * down * geometry.v for a in (-1, 1) for b in (-1, 1)]
+    )
+    # Over the panel, |z| is at most that of a corner, the larger of |x| and |y| at least the
+    # distance from the axis of z over the root of 2, and that distance at least its part along the
+    # way to the centre.
+    level = centre[:, :2] / np.linalg.norm(centre[:, :2], axis=1, keepdims=True).clip(1e-30)
+    nearest = np.sum(corners[:, :, :2] * level, axis=2).min(axis=0)
+    highest = np.abs(corners[:, :, 2]).max(axis=0)
+    return bool(np.any(1.0001 * highest > nearest / np.sqrt(2)))
+
+
+def _best_lanes(device: cl.Device) -> int:
+    """Lanes of the kernels, see geometry.clh."""
+    if not opencl.is_cpu(device):
+        return 1
+    return 16 if device.native_vector_width_float >= 16 else 8
 
 
 def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:

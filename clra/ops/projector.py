@@ -21,7 +21,7 @@ from clra.ops.steps import Step
 # sixth of the speed, of 128 a third.
 _LINE = 1024
 _ADJOINT_LINE, _WIDTH = 512, 16
-# Columns of voxels that a CPU back-projects for all y before it goes on, see backproject.cl.
+# Columns of voxels that a CPU back-projects for all y before it goes on, as in the kernels.
 _STRIP = 32
 
 # Part of the volume that a CPU projects for all views of a launch before it goes on: at twice the
@@ -85,8 +85,8 @@ class ForwardProjector:
             context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
         )
         self.scratch_bytes = self._layout.scratch_bytes
-        kernels = ("forwardproject.cl", "forward_columns", "forward_rays")
-        self._project = Blocks(self._layout, *kernels, geometry.rows, _LINE)
+        kernels = ("forward_rays", "forward_columns", "forward_tilted")
+        self._project = Blocks(self._layout, "forwardproject", kernels, geometry.rows, _LINE)
         nz, ny, nx = grid.shape
         planes = max(nz, ny, nx)
         thick = planes
@@ -218,14 +218,15 @@ class BackProjector:
         self.scratch_bytes = self._layout.scratch_bytes
         nz = grid.shape[0]
         if matched:
-            kernels = ("adjoint.cl", "adjoint_columns", "adjoint_voxels")
+            kernels = ("adjoint_voxels", "adjoint_columns", "adjoint_tilted")
             width = {"WIDTH": _WIDTH}
-            self._project = Blocks(self._layout, *kernels, nz, _ADJOINT_LINE, width)
+            self._project = Blocks(self._layout, "adjoint", kernels, nz, _ADJOINT_LINE, width)
             lanes = {"LANES": self._layout.lanes}
             self._weigh = Step(context, "adjoint.cl", "weigh_rays", (64, 1, 1), lanes)
         else:
-            kernels = ("backproject.cl", "backproject_columns", "backproject_voxels")
-            self._project = Blocks(self._layout, *kernels, nz, _LINE, {"STRIP": _STRIP})
+            kernels = ("backproject_voxels", "backproject_columns", "backproject_tilted")
+            strip = {"STRIP": _STRIP}
+            self._project = Blocks(self._layout, "backproject", kernels, nz, _LINE, strip)
         self._matched = matched
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
@@ -294,7 +295,7 @@ class BackProjector:
     def _size(self) -> tuple[int, int]:
         """Global size across the columns."""
         nx, ny, _ = self._layout.sizes
-        return (_STRIP, ny * -(-nx // _STRIP)) if self._layout.columnar else (nx, ny)
+        return (_STRIP, ny * -(-nx // _STRIP)) if self._layout.lanes > 1 else (nx, ny)
 
     def _adjoint(
         self,
@@ -315,14 +316,19 @@ class BackProjector:
             *layout.panel,
             len(lines),
             int(layout.columnar),
+            int(layout.lanes > 1 and not layout.columnar),
             layout.grid.voxel_size,
             wait_for=[event],
         )
         nx, ny, _ = layout.sizes
-        if not layout.columnar:
+        if layout.lanes == 1:
             return self._project(queue, (nx, ny), columns, lines, views, adds, wait_for=[event])
         for axis, size in enumerate([(nx, -(-ny // _WIDTH)), (ny, -(-nx // _WIDTH))]):
             event = self._project(
                 queue, size, columns, lines, views, axis, max(adds, axis), wait_for=[event]
+            )
+        if layout.steep:
+            event = self._project(
+                queue, (nx, ny), columns, lines, views, 1, wait_for=[event], singly=True
             )
         return event

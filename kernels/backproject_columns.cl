@@ -1,0 +1,107 @@
+// backproject.cl for CPUs and views whose v is parallel to z: the voxels of a column share g and
+// the detector column, and row is linear in z. So two adjacent detector columns are blended once
+// and the blend is resampled.
+//
+// A work-item sums BLOCK voxels along z over the given views. Every voxel has to be in front of
+// every source (g > 0).
+
+#ifndef LANES
+#define LANES 8
+#endif
+
+#include "geometry.clh"
+#include "pieces.clh"
+
+#ifndef BLOCK
+#define BLOCK (32 * LANES) // whole LANES
+#endif
+
+// Lines along x that are treated for all y before going on: so what they see of the projections
+// stays in the cache. Half or twice as many change nothing; all of 448 halve the speed for 16
+// views.
+#ifndef STRIP
+#define STRIP 32
+#endif
+
+// Global size (blocks, STRIP, ny ceil(nx / STRIP)), rounded up at will.
+kernel void backproject_columns(
+    global float *restrict volume, // (ny, nx, nz)
+    const ulong volume_offset,
+    global const float *restrict projections, // (count, columns + 1, pitch), padded
+    const ulong projections_offset,
+    global const float *restrict views, // (count, VIEW_FLOATS)
+    const ulong views_offset,
+    const int nx, // voxels
+    const int ny,
+    const int nz,
+    const int columns, // pixels
+    const int rows,
+    const int pitch, // elements of a padded line
+    const int count, // views
+    const int accumulate) // 1: add to the volume
+{
+    volume += volume_offset;
+    projections += projections_offset + PAD;
+    views += views_offset;
+    const int z = get_global_id(0) * BLOCK;
+    const int x = get_global_id(1) + get_global_id(2) / ny * STRIP;
+    const int y = get_global_id(2) % ny;
+    if (z >= nz || get_global_id(1) >= STRIP || x >= nx)
+        return;
+    const int voxels = min(BLOCK, nz - z);
+    const float last_column = columns - 1;
+    const float last_row = rows - 1;
+
+    float sum[BLOCK];
+    for (int k = 0; k < BLOCK; ++k)
+        sum[k] = 0.0f;
+    for (int view = 0; view < count; ++view) {
+        global const float *m = views + view * VIEW_FLOATS;
+        const float g = fma(m[8], (float)x, fma(m[9], (float)y, m[11]));
+        const float scale = 1.0f / g;
+        const float column = fma(m[0], (float)x, fma(m[1], (float)y, m[3])) * scale;
+        if (!(column >= 0.0f && column <= last_column))
+            continue;
+        const float row =
+            fma(m[4], (float)x, fma(m[5], (float)y, fma(m[6], (float)z, m[7]))) * scale;
+        const float slope = m[6] * scale;
+        // the voxels at the panel's first and last row
+        const float per_row = 1.0f / slope;
+        const float one = -row * per_row;
+        const float other = (last_row - row) * per_row;
+        const float first = SMALLER(one, other);
+        const float last = LARGER(one, other);
+        if (last < 0.0f || first >= voxels)
+            continue;
+        const int start = (int)LARGER(first, 0.0f) / LANES * LANES;
+        const int stop = (int)SMALLER(last, voxels - 1.0f) + 1;
+
+        const int c = (int)column;
+        global const float *line = projections + ((size_t)view * (columns + 1) + c) * pitch;
+        global const float *next = line + pitch;
+        const float next_weight = (column - c) * scale * scale;
+        const float line_weight = scale * scale - next_weight;
+        if (fabs(slope) * (LANES - 1) > SPAN) {
+            for (int k = start; k < stop; ++k) {
+                const float r = fma(slope, (float)k, row);
+                if (r >= 0.0f && r <= last_row)
+                    sum[k] += line_weight * tap(line, rows, r) + next_weight * tap(next, rows, r);
+            }
+            continue;
+        }
+        steps step = steps_from(fma(slope, (float)start, row), slope);
+        for (int k = start; k < stop; k += LANES) {
+            const int base = step_base(step);
+            const whole at = step_lanes(step);
+            const piece both = blend(line_weight, line + base, next_weight, next + base);
+            real value = between(both, whole_part(at), fraction(at));
+            if (k == start || k + LANES >= stop) { // only here may lanes be off the panel
+                const real r = slope * ((float)k + RAMP) + row;
+                value = WHERE((r >= 0.0f) & (r <= last_row), value);
+            }
+            store_lanes(load_lanes(sum + k) + value, sum + k);
+            step.lowest += step.advance;
+        }
+    }
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, voxels, accumulate);
+}
