@@ -72,7 +72,7 @@ kernel void pi_backproject(
     const int z = bottom + get_global_id(0) * BLOCK;
     const int x = get_global_id(1) + get_global_id(2) / ny * strip;
     const int y = get_global_id(2) % ny;
-    if (z >= top || get_global_id(1) >= strip || x >= nx)
+    if (z >= top || (int)get_global_id(1) >= strip || x >= nx)
         return;
     const int voxels = min(BLOCK, top - z);
     const size_t column_of_voxels = (size_t)y * nx + x;
