@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from clra.app.commands_reconstruct import reconstruct
 from clra.app.console import Console, Memory, Reading, command
 
 ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
@@ -24,8 +25,9 @@ def align(
     method: Annotated[
         str,
         typer.Option(
-            metavar="ra|reference",
-            help="Re-projection alignment, or only the slow drift against a reference scan.",
+            metavar="ra|imgr|reference",
+            help="Re-projection alignment, by itself or within a multigrid reconstruction; or only "
+            "the slow drift against a reference scan.",
         ),
     ] = "ra",
     reference: Annotated[
@@ -40,7 +42,7 @@ def align(
         typer.Option(
             metavar="TEXT",
             help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
-            "auto: QR until converged, then 1HR.",
+            "auto: QR until converged, then 1HR. With imgr the levels of a cycle: QR-HR-FR.",
         ),
     ] = "auto",
     estimate: Annotated[
@@ -60,6 +62,10 @@ def align(
     report: Annotated[
         Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
     ] = None,
+    volume: Annotated[
+        Path | None,
+        typer.Option(metavar="VOLUME", help="imgr: write its volume as well, .h5 or .tif."),
+    ] = None,
 ) -> None:
     """Estimate how each radiograph moved.
 
@@ -70,20 +76,28 @@ def align(
     --------
       clra align scan.nxs -o motion.h5
       clra align scan.nxs -o motion.h5 --schedule 1QR-1HR --report report.html
+      clra align scan.nxs -o motion.h5 --method imgr --volume volume.h5
       clra align scan.nxs -o motion.h5 --reference quick.nxs
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
     """
+    from clra.app.arguments import volume_file
     from clra.app.errors import InterruptedCommandError
     from clra.app.findings import Errors, findings_of, summary_of
     from clra.app.records import Record
     from clra.io.atomic import ensure_writable
+    from clra.io.volumes import write_volume
     from clra.methods.alignment import align as align_scan
     from clra.methods.results import AlignmentInterrupted
-    from clra.model.schedule import parse_schedule
+    from clra.model.grid import default_grid
+    from clra.model.schedule import parse_levels, parse_schedule
 
-    parse_schedule(schedule)
+    (parse_levels if method == "imgr" else parse_schedule)(schedule)
+    if volume is not None:
+        if method != "imgr":
+            raise ValueError(f"--volume: found it with --method {method}, expected imgr")
+        volume_file(volume)
     limits = memory.limits()
-    for path in (out, report):
+    for path in (out, report, volume):
         if path is not None:
             ensure_writable(path)
     opened = reading.scan(scan)
@@ -118,86 +132,26 @@ def align(
         record = Record.of(result, opened, **about)
         record.save(out)
         errors = Errors.of(record, opened)
+        if volume is not None and result.volume is not None:
+            grid = default_grid(opened.geometry)
+            write_volume(volume, result.volume, grid, progress=progress)
         if report is not None:
             from clra.app.report import write_report
 
             findings = findings_of(
-                record, opened, device=console.device, progress=progress, **limits
+                record,
+                opened,
+                volume=result.volume,
+                device=console.device,
+                progress=progress,
+                **limits,
             )
             write_report(report, findings)
     values, text = summary_of(record, errors)
-    written = {"file": out, **({"report": report} if report else {})}
+    more = {"volume": volume, "report": report}
+    written = {"file": out, **{name: path for name, path in more.items() if path}}
     names = " and ".join(str(path) for path in written.values())
     console.summary({**written, **values}, f"wrote {names}\n{text}")
-
-
-def reconstruct(
-    console: Console,
-    reading: Reading,
-    memory: Memory,
-    scan: ScanPath,
-    out: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="VOLUME", help="Volume to write: .h5 or .tif."),
-    ],
-    method: Annotated[
-        str,
-        typer.Option(
-            metavar="fbp|katsevich",
-            help="Ramp-filtered back-projection, for any trajectory, or Katsevich's exact one, for "
-            "helices.",
-        ),
-    ] = "fbp",
-    motion: MotionPath = None,
-    align: Annotated[
-        bool, typer.Option("--align", help="Align the scan first, as clra align would.")
-    ] = False,
-) -> None:
-    """Reconstruct a volume.
-
-    Covers the whole field of view, in 1/mm. With fbp the motion goes into the geometry: no
-    radiograph is resampled. With katsevich each is resampled once.
-
-    Examples
-    --------
-      clra reconstruct scan.nxs -o volume.h5 --motion motion.h5
-      clra reconstruct scan.nxs -o volume.tif --align
-      clra reconstruct helix.nxs -o volume.h5 --method katsevich --align
-    """
-    from clra.app.arguments import volume_file
-    from clra.app.describe import metric
-    from clra.app.outputs import motion_for, room_for
-    from clra.io.volumes import open_volume
-    from clra.methods.reconstruction import METHODS, reconstruct_into
-    from clra.model.grid import default_grid
-
-    volume_file(out)
-    limits = memory.limits()
-    if motion is not None and align:
-        raise ValueError("--motion, --align: found both, expected one of them")
-    if method not in METHODS:
-        raise ValueError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
-    opened = reading.scan(scan)
-    known = None if motion is None else motion_for(opened, motion)
-    grid = default_grid(opened.geometry)
-    nz, ny, nx = grid.shape
-    room_for(out, 4 * nz * ny * nx)
-    with console.progress() as progress, open_volume(out, grid) as target:
-        reconstruct_into(
-            target,
-            opened,
-            method=method,
-            grid=grid,
-            motion=known,
-            align=align,
-            device=console.device,
-            progress=progress,
-            **limits,
-        )
-    console.summary(
-        {"file": out, "shape": grid.shape, "voxel_mm": grid.voxel_size, "units": "1/mm"},
-        f"wrote {out}: {nx} x {ny} x {nz} voxels of {metric(grid.voxel_size)}, in 1/mm",
-    )
 
 
 def correct(

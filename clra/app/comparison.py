@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.app.slices import Slicer
+from clra.app.slices import MultigridSlicer, Slicer
 from clra.methods.fbp import ramp_fbp
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
@@ -92,7 +92,11 @@ class Comparison:
 
 
 def compare(
-    stream: Stream, scan: Scan, motion: Motion, confidence: NDArray[np.float64]
+    stream: Stream,
+    scan: Scan,
+    motion: Motion,
+    confidence: NDArray[np.float64],
+    volume: Image | None = None,
 ) -> Comparison:
     """Reconstruct slices and re-project some views, without and with the motion.
 
@@ -106,8 +110,14 @@ def compare(
         As estimated.
     confidence : ndarray, (views,)
         Of the estimate; the view with the least is shown.
+    volume : ndarray, (nz, ny, nx), optional
+        By multigrid iteration, aligned: slices are of this one, and of one made without alignment.
     """
-    slicer = Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS))
+    slicer = (
+        Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS))
+        if volume is None
+        else MultigridSlicer(stream, scan, volume)
+    )
     horizontal, vertical = (Pair(*slicer.images(plane)) for plane in _middle_planes(slicer.grid))
     level = _level(scan, _VOLUME_COLUMNS)
     radiographs = Radiographs(stream, scan, level)

@@ -98,6 +98,7 @@ def findings_of(
     record: Record,
     scan: Scan | None,
     *,
+    volume: NDArray[np.float32] | None = None,
     device: Any = None,
     progress: "Report | None" = None,
     max_device_memory: int | None = None,
@@ -111,6 +112,8 @@ def findings_of(
         Of the alignment.
     scan : Scan, optional
         The one that was aligned.
+    volume : ndarray, (nz, ny, nx), optional
+        By multigrid iteration, aligned: it is shown beside one that was not.
     device : str or cl.Device, optional
         Where to reconstruct.
     progress : callable, optional
@@ -132,7 +135,7 @@ def findings_of(
     return Findings(
         record,
         errors=Errors.of(record, scan),
-        comparison=compare(stream, scan, record.motion, record.confidence),
+        comparison=compare(stream, scan, record.motion, record.confidence, volume),
         facts=Facts.of(scan).lines(),
     )
 

@@ -135,7 +135,7 @@ class Record:
         return cls(
             motion=file.motion,
             confidence=unknown if file.confidence is None else file.confidence,
-            history=_history(file),
+            history=history_of(file),
             gauge=_gauge(file),
             sigma=_sigma(file),
             about=about,
@@ -158,8 +158,8 @@ def _source_travel(motion: Motion, scan: Scan) -> dict[str, str]:
     return {"source_travel": f"{across}, {along}, {toward} um along columns, rows and beam"}
 
 
-def _history(file: MotionFile) -> tuple[Iteration, ...]:
-    """Rows of the columns; none if another version wrote other columns."""
+def history_of(file: MotionFile) -> tuple[Iteration, ...]:
+    """Return the iterations that a file tells; none if another version wrote other columns."""
     names = [f.name for f in fields(Iteration)]
     if not set(names) <= set(file.history):
         return ()

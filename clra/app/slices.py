@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
+from clra.methods.imgr import imgr
 from clra.methods.katsevich import exact_helices, katsevich
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -86,6 +87,44 @@ class Slicer:
             ]
         without, corrected_one = (_upright(volume.to_host()) for volume in volumes)
         return without, corrected_one
+
+
+class MultigridSlicer:
+    """Slices of volumes by multigrid iteration, without alignment and with it.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        As measured: it is reconstructed once more, without alignment.
+    volume : ndarray, (nz, ny, nx)
+        Aligned, on the grid of the whole field of view.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+        Of the whole field of view.
+    method : str
+        What it reconstructs by, for reading.
+    """
+
+    method = "multigrid iteration, without and with alignment inside"
+
+    def __init__(self, stream: Stream, scan: Scan, volume: Image) -> None:
+        self.grid = default_grid(scan.geometry)
+        self._volumes = imgr(stream, scan, self.grid).volume.to_host(), volume
+
+    def images(self, plane: VolumeGrid) -> tuple[Image, Image]:
+        """Cut a slice out of both, as :meth:`Slicer.images` does."""
+        corner = [axis[0] for axis in plane.coordinates()]
+        start = [
+            int(np.argmin(np.abs(axis - first)))
+            for axis, first in zip(self.grid.coordinates(), corner, strict=True)
+        ]
+        window = tuple(slice(a, a + n) for a, n in zip(start[::-1], plane.shape, strict=True))
+        without, aligned = (_upright(volume[window]) for volume in self._volumes)
+        return without, aligned
 
 
 def _upright(volume: Image) -> Image:

@@ -194,6 +194,7 @@ def start_volume(
     ValueError
         If a given volume is not of the grid's shape.
     """
+    ordered_subsets(geometry, grid, options.subsets)  # refuses a wrong number before the long work
     volume = constant_volume(stream, grid, volumes=VOLUMES)
     if not isinstance(options.initial, str):
         given = volume_from(stream, grid, options.initial, volumes=VOLUMES)

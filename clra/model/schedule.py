@@ -56,6 +56,11 @@ def level_name(level: int) -> str:
     raise ValueError(f"level: found {level}, expected one of {tuple(_LEVELS.values())}")
 
 
+def level_factor(name: str) -> int:
+    """Return the binning factor of "FR", "HR", "QR" or "ER"."""
+    return _LEVELS[name]
+
+
 def parse_levels(text: str) -> tuple[int, ...]:
     """Read the levels of a multigrid cycle.
 

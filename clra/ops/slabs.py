@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import NDArray
 from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
@@ -40,9 +39,7 @@ def constant_volume(
     return volume
 
 
-def volume_from(
-    stream: Stream, grid: VolumeGrid, values: NDArray[Any], *, volumes: int = 1
-) -> Volume:
+def volume_from(stream: Stream, grid: VolumeGrid, values: Any, *, volumes: int = 1) -> Volume:
     """Return the volume that an array (z, y, x) holds.
 
     Parameters

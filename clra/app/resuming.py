@@ -1,0 +1,136 @@
+"""What an interrupted multigrid reconstruction leaves behind, and how it goes on."""
+
+import json
+import os
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.app.records import history_of
+from clra.io.errors import InputError, OutputError
+from clra.io.motions import read_motion_file, write_motion_file
+from clra.io.scans import scan_checksum
+from clra.io.volumes import open_volume, read_volume
+from clra.methods.multigrid import Progressed, Step
+from clra.methods.reprojection import with_margin
+from clra.model.grid import VolumeGrid
+from clra.model.scan import Scan
+from clra.model.schedule import level_factor
+from clra.ops.slabs import volume_from
+from clra.ops.streaming import Stream
+
+
+class Leftover:
+    """The folder beside a volume that holds what the finished levels gave.
+
+    volume.h5 is the volume at the resolution of the last level, with its margin; motion.h5 the
+    motion, the history and the settings of the run.
+
+    Parameters
+    ----------
+    out : path-like
+        Volume that is to be written.
+    scan : Scan
+        That is reconstructed.
+    settings : mapping
+        What has to be the same for the run to go on, as JSON takes it.
+
+    Attributes
+    ----------
+    folder : Path
+        Where it is.
+    """
+
+    def __init__(self, out: str | os.PathLike[str], scan: Scan, settings: dict[str, Any]) -> None:
+        self.folder = Path(out).with_name(f"{Path(out).name}.resume")
+        self._scan = scan
+        self._settings = json.dumps(settings, sort_keys=True)
+
+    def save(self, progressed: Progressed) -> None:
+        """Keep what the finished levels gave.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written.
+        """
+        assert progressed.volume is not None
+        self.clear()
+        try:
+            self.folder.mkdir()
+        except OSError as error:
+            raise OutputError(f"cannot make the folder {self.folder}: {error.strerror}") from error
+        with open_volume(self.folder / "volume.h5", progressed.volume.grid) as target:
+            progressed.volume.write(target)
+        # Last, so that it stands for the whole.
+        write_motion_file(
+            self.folder / "motion.h5",
+            progressed.motion,
+            confidence=np.where(progressed.weak, 0.0, 1.0),
+            history=progressed.history,
+            scan=self._scan.name,
+            checksum=scan_checksum(self._scan),
+            attributes={
+                "settings": self._settings,
+                "steps": json.dumps([asdict(step) for step in progressed.steps]),
+                "ended": "yes" if progressed.ended else "no",
+            },
+        )
+
+    def load(self, stream: Stream, grid: VolumeGrid) -> Progressed:
+        """Take up what the finished levels gave.
+
+        Parameters
+        ----------
+        stream : Stream
+            Where the volume goes.
+        grid : VolumeGrid
+            Of the volume that is to be written.
+
+        Raises
+        ------
+        InputError
+            If there is nothing, or it belongs to another scan or to other settings.
+        """
+        path = self.folder / "motion.h5"
+        if not path.is_file():
+            raise InputError(f"{path}: not found, expected what an interrupted run leaves there")
+        file = read_motion_file(path)
+        if file.attributes.get("checksum") != scan_checksum(self._scan):
+            raise InputError.at(path, "/@checksum", "another scan", self._scan.name)
+        if file.attributes.get("settings") != self._settings:
+            found = file.attributes.get("settings", "none")
+            raise InputError.at(path, "/@settings", found, self._settings)
+        steps = tuple(Step(**step) for step in json.loads(file.attributes["steps"]))
+        level = level_factor(steps[-1].level)
+        wide = with_margin(grid)
+        wide = wide.binned(level) if level > 1 else wide
+        volume = volume_from(stream, wide, _Planes(self.folder / "volume.h5", wide))
+        assert file.confidence is not None
+        return Progressed(
+            volume,
+            file.motion,
+            file.confidence == 0,
+            steps,
+            history_of(file),
+            file.attributes.get("ended") == "yes",
+        )
+
+    def clear(self) -> None:
+        """Remove it, if there is any."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class _Planes:
+    """A volume in a file, read when planes of it are asked for."""
+
+    def __init__(self, path: Path, grid: VolumeGrid) -> None:
+        self.shape = grid.shape
+        self._path = path
+
+    def __getitem__(self, planes: slice) -> NDArray[np.float32]:
+        return read_volume(self._path, planes.start, planes.stop)[0]

@@ -1,0 +1,111 @@
+"""Iterative reconstruction from the command line: what it writes, refuses, keeps and resumes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from clra.io.scans import read_scan
+from clra.io.volumes import read_volume, write_volume
+from clra.model.grid import default_grid
+from clra.ops.streaming import Stream
+from tests.app.test_cli import refused
+
+
+def test_osem_tr_starts_from_a_volume(clra, scan_file, tmp_path):
+    first, second = tmp_path / "a.h5", tmp_path / "b.h5"
+    code, out, err = clra(
+        "reconstruct", scan_file, "-o", first, "--method", "osem-tr", "--passes", 1, "--subsets", 3
+    )
+    assert code == 0 and str(first) in out, err
+    again = ("--initial", first, "--i0", 5000, "--passes", 1, "--update", "optimal")
+    code, out, err = clra("reconstruct", scan_file, "-o", second, "--method", "osem-tr", *again)
+    assert code == 0, err
+    (one, grid), (other, _) = read_volume(first), read_volume(second)
+    assert one.shape == default_grid(read_scan(scan_file).geometry).shape
+    assert one.min() >= 0 and not np.array_equal(one, other)
+    wrong = tmp_path / "wrong.h5"
+    write_volume(wrong, one[1:], grid.slab(1, grid.shape[0]))
+    done = clra("reconstruct", scan_file, "-o", second, "--method", "osem-tr", "--initial", wrong)
+    refused(done, 2, wrong, "/volume", one[1:].shape, one.shape)
+
+
+def test_align_by_imgr_writes_motion_volume_and_report(clra, scan_file, tmp_path):
+    motion, volume, page = (tmp_path / name for name in ("m.h5", "v.h5", "r.html"))
+    outputs = ("-o", motion, "--volume", volume, "--report", page)
+    code, out, err = clra(
+        "align", scan_file, *outputs, "--method", "imgr", "--schedule", "HR-FR", "--json"
+    )
+    assert code == 0, err
+    told = json.loads(out)
+    assert told["volume"] == str(volume)
+    assert [i["level"] for i in told["history"]][:2] == ["HR", "FR"]
+    assert all(i["misfit"] > 0 for i in told["history"])
+    assert read_volume(volume)[0].std() > 0
+    text = page.read_text(encoding="utf-8")
+    assert "without and with alignment inside" in text
+    assert "Correction of each radiograph" in text
+
+
+@pytest.fixture
+def stopping(monkeypatch):
+    """Press Ctrl-C after so many levels."""
+
+    def after(levels):
+        reports = []
+
+        def report(self, stage, done, total):
+            if levels is not None and len(reports) >= levels:
+                raise KeyboardInterrupt
+            if "misfit" in stage:
+                reports.append(stage)
+
+        monkeypatch.setattr(Stream, "report", report)
+
+    return after
+
+
+def test_resumed_to_the_bit(clra, scan_file, tmp_path, stopping):
+    options = ("--method", "imgr", "--align", "--levels", "HR-FR")
+    whole, out = tmp_path / "whole.h5", tmp_path / "volume.h5"
+    code, _, err = clra("reconstruct", scan_file, "-o", whole, *options)
+    assert code == 0, err
+
+    refused(clra("reconstruct", scan_file, "-o", out, *options, "--resume"), 2, "not found")
+    stopping(1)
+    done = clra("reconstruct", scan_file, "-o", out, *options)
+    refused(done, 130, "volume.h5.resume", "keeps cycle 1 up to HR", "--resume")
+    assert not out.exists()
+    half, _ = read_volume(tmp_path / "volume.h5.resume" / "volume.h5")
+    assert half.std() > 0
+    stopping(None)
+    done = clra("reconstruct", scan_file, "-o", out, "--method", "imgr", "--resume")
+    refused(done, 2, "motion.h5", "/@settings")
+    code, told, err = clra("reconstruct", scan_file, "-o", out, *options, "--resume", "--json")
+    assert code == 0, err
+    assert [step["level"] for step in json.loads(told)["steps"]][:2] == ["HR", "FR"]
+    np.testing.assert_array_equal(read_volume(out)[0], read_volume(whole)[0])
+    assert not (tmp_path / "volume.h5.resume").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        (["--subsets", 3], ["subsets", "fbp does not have"]),
+        (["--method", "osem-tr", "--levels", "QR-HR-FR"], ["levels", "osem-tr does not have"]),
+        (["--method", "osem-tr", "--resume"], ["--resume", "expected imgr"]),
+        (["--method", "osem-tr", "--update", "newton"], ["update", "'newton'", "paraboloid"]),
+        (["--method", "osem-tr", "--i0", -5], ["i0", "found -5", "photons"]),
+        (["--method", "osem-tr", "--subsets", 25], ["subsets", "found 25", "at most 24"]),
+        (["--method", "imgr", "--levels", "FR-HR"], ["levels", "'FR-HR'", "'QR-HR-FR'"]),
+    ],
+)
+def test_wrong_options_are_refused(clra, scan_file, tmp_path, options, parts):
+    out = tmp_path / "v.h5"
+    refused(clra("reconstruct", scan_file, "-o", out, *options), 2, *parts)
+    assert not out.exists()
+
+
+def test_a_volume_of_other_methods_is_refused(clra, scan_file, tmp_path):
+    done = clra("align", scan_file, "-o", tmp_path / "m.h5", "--volume", tmp_path / "v.h5")
+    refused(done, 2, "--volume", "expected imgr")
