@@ -13,10 +13,12 @@ from clra.model.motion import Motion
 
 MIB = 1 << 20
 HOST, DEVICE = 32 * MIB, 16 * MIB
-# Runs a command and tells the largest resident size of its process.
+# Runs a command and tells the largest resident size of its process. (ru_maxrss begins with that of
+# the process that started it.)
 RUN = """
-import atexit, resource, sys
-atexit.register(lambda: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+import atexit, pathlib
+status = pathlib.Path("/proc/self/status")
+atexit.register(lambda: print(status.read_text().partition("VmHWM:")[2].split()[0]))
 from clra.app.cli import main
 main()
 """
