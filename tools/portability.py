@@ -7,7 +7,8 @@
 - ``two-devices``: every operator on either device of a context of two (PoCL);
 - ``oclgrind``: every kernel, in both forms, with race detection and API checks (Debian
   ``oclgrind``); what it complains of fails;
-- ``same-numbers``: every operator on all of these devices at once, to 1e-5.
+- ``same-numbers``: every operator on all of these devices at once, to 1e-5, and Katsevich's volume
+  to 1e-4.
 
 ``--install`` gets what is missing by pip and, as root on Debian, by apt-get. ``--quick`` leaves out
 what takes minutes. What cannot run is skipped with a word; the exit status is 1 if anything failed.
@@ -120,7 +121,10 @@ def runs(quick: bool) -> dict[str, Run]:
             command=("oclgrind", "--data-races", "--check-api", "--log", "{log}"),
         ),
         "same-numbers": Run(
-            ("tests/ops/test_runtimes.py",), neither, rusticl, icds=(INTEL, RUSTICL)
+            ("tests/ops/test_runtimes.py", "tests/methods/test_katsevich_runtimes.py"),
+            neither,
+            rusticl,
+            icds=(INTEL, RUSTICL),
         ),
     }
 
