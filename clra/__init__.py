@@ -5,7 +5,27 @@ OpenCL; each lives in the module that the table below names.
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
+    from clra import kernels as kernels
+    from clra.io.scans import read_scan as read_scan
+    from clra.methods.alignment import align as align
+    from clra.methods.correction import correct as correct
+    from clra.methods.reconstruction import reconstruct as reconstruct
+    from clra.model.geometry import ConeBeamGeometry as ConeBeamGeometry
+    from clra.model.grid import VolumeGrid as VolumeGrid
+    from clra.model.motion import Motion as Motion
+    from clra.model.scan import Scan as Scan
+    from clra.model.trajectory import circular as circular
+    from clra.model.trajectory import double_helix as double_helix
+    from clra.model.trajectory import helix as helix
+    from clra.model.trajectory import space_filling as space_filling
+    from clra.ops.alignment_step import AlignmentStep as AlignmentStep
+    from clra.ops.linear import as_linear_operator as as_linear_operator
+    from clra.ops.opencl import devices as devices
+    from clra.ops.projector import BackProjector as BackProjector
+    from clra.ops.projector import ForwardProjector as ForwardProjector
 
 _HOMES = {
     "ConeBeamGeometry": "clra.model.geometry",

