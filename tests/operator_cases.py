@@ -17,9 +17,11 @@ from clra.ops.coverage import Coverage
 from clra.ops.fft import RealFFT
 from clra.ops.filtering import RampFilter
 from clra.ops.katsevich import KatsevichFilter
+from clra.ops.multigrid import Residual
 from clra.ops.pibackproject import PiBackProjector
 from clra.ops.pyramid import Prolong3D, Restrict2D, Restrict3D
 from clra.ops.registration import Registration
+from clra.ops.transmission import RayStatistics, VolumeStep
 from clra.ops.warp import Warp
 
 FORMS = 2e-5  # of the largest value: forms of a kernel for CPU and GPU differ by roundings
@@ -106,6 +108,7 @@ class Case:
 MOTION = np.array([[0.3, -0.4, 1.01]] * VIEWS, np.float32)
 PAIR = (radiographs(), radiographs())
 PAIR[1][:] += 4 * np.roll(PAIR[0], (0, -1), (1, 2))
+PHOTONS = RANDOM.uniform(500, 1500, (ROWS, COLUMNS))
 ROCK = porous(1.0, 1.2, seed=2, count=40).line_integrals(GEOMETRY)
 CASES = {
     "forward": Case(
@@ -177,6 +180,45 @@ CASES = {
         PAIR,
         closeness=REGISTERED,
     ),
+    "residual": Case(
+        lambda c: Residual(c, np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS) % 7 > 0),
+        IMAGES,
+        (values(*IMAGES), values(*IMAGES), MOTION),
+    ),
+    **{
+        f"likelihood, {name}": Case(
+            lambda c: RayStatistics(c, PHOTONS, 3.0),
+            IMAGES,
+            tuple(values(*IMAGES) for _ in range(count)),
+            lambda operator, name=name: getattr(operator, name),
+        )
+        for name, count in (("gradient", 2), ("curvature", 2), ("optimal_curvature", 3))
+    },
+    "likelihood, balance": Case(
+        lambda c: RayStatistics(c, PHOTONS, 3.0),
+        IMAGES,
+        (values(*IMAGES), values(*IMAGES)),
+        lambda operator: operator.balance,
+        before=0.4,
+    ),
+    "add step": Case(
+        VolumeStep,
+        GRID.shape,
+        (values(*GRID.shape), values(*GRID.shape)),
+        lambda operator: (
+            lambda queue, out, numerator, denominator, wait_for=None: operator.add(
+                queue, out, numerator, denominator, 0.5, 0.2, wait_for
+            )
+        ),
+        before=0.4,
+    ),
+    "multiply step": Case(
+        VolumeStep,
+        GRID.shape,
+        (values(*GRID.shape), values(*GRID.shape)),
+        lambda operator: operator.multiply,
+        before=0.4,
+    ),
     "alignment step": Case(
         lambda c, **a: clra.AlignmentStep(c, GEOMETRY, GRID, high_pass=4.0, **a),
         (VIEWS, 10),
@@ -184,8 +226,24 @@ CASES = {
         closeness=REGISTERED,
     ),
 }
-WITHOUT_SCRATCH = ("restrict images", "restrict", "prolong", "transform")
-WITH_SCRATCH = tuple(name for name in CASES if name not in WITHOUT_SCRATCH)
+# What takes memory between its kernels, or may take it, and so an allocator.
+WITH_SCRATCH = (
+    "forward",
+    "back",
+    "adjoint",
+    "tilted forward",
+    "tilted back",
+    "tilted adjoint",
+    "katsevich",
+    "pi back",
+    "ramp",
+    "coverage",
+    "warp",
+    "band-pass",
+    "phase correlation",
+    "registration",
+    "alignment step",
+)
 
 
 def result(case: Case, operator: Any, queue: cl.CommandQueue) -> np.ndarray:

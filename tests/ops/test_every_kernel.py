@@ -6,13 +6,18 @@ Few and quick, so that they can be run under a checker such as Oclgrind, see too
 import warnings
 
 import numpy as np
+import pyopencl.array as cl_array
 import pytest
-from operator_cases import CASES, result
+from operator_cases import CASES, GRID, IMAGES, result
 
 from clra import kernels
 from clra.kernels.header import signatures
 from clra.ops import correlation, opencl
+from clra.ops.multigrid import add_update, cropped
+from clra.ops.slabs import volume_from
 from clra.ops.steps import Step
+from clra.ops.streaming import Stream
+from clra.ops.transmission import RayStatistics
 
 # Where kernels may have no more than 32 work-items (Rusticl of Mesa 22) reikna gives up.
 pytestmark = pytest.mark.filterwarnings("ignore:.*transforms run on the host:UserWarning")
@@ -31,6 +36,20 @@ def test_forms_for_cpu_and_gpu_agree(name, context, queue, monkeypatch):
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=atol)
 
 
+def go_through_a_stream() -> None:
+    """What works on volumes in slabs instead of on arrays."""
+    stream = Stream(opencl.choose_device())
+    volume = volume_from(stream, GRID, np.ones(GRID.shape, np.float32))
+    add_update(stream, volume, cropped(stream, volume, 0, GRID))
+    assert (volume.to_host() == 2).all()
+    part = cropped(stream, volume, 1, GRID.slab(1, 4))
+    assert (part.to_host() == 2).all()
+    images = cl_array.to_device(stream.queue, np.ones(IMAGES, np.float32))
+    statistics = RayStatistics(stream.context, np.ones(IMAGES[1:]))
+    statistics.deviance(stream.queue, images, images)
+    assert statistics.misfit(stream.queue, IMAGES[0]) == 0
+
+
 def test_no_kernel_is_left_out(context, queue, monkeypatch):
     launched, launch = set(), Step.__call__
 
@@ -44,5 +63,6 @@ def test_no_kernel_is_left_out(context, queue, monkeypatch):
             monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
             for case in CASES.values():
                 result(case, case.make(context), queue)
+        go_through_a_stream()
     files = [file for file in kernels.names() if file != "fft.cl" or not warned]
     assert launched >= {one.name for file in files for one in signatures(file)}
