@@ -84,3 +84,15 @@ def test_shifts_and_report(wood, tmp_path, clra):
     text = page.read_text(encoding="utf-8")
     assert "reconstructed by Katsevich" in text
     assert "mirrored about the dashed line" in text
+
+
+@pytest.mark.parametrize("options", [[], ["--align"]])
+def test_what_katsevich_cannot_treat_ends_with_one_line(scan_file, tmp_path, clra, options):
+    out = tmp_path / "volume.h5"
+    status, _, err = clra(
+        "reconstruct", scan_file, "-o", out, "--method", "katsevich", "--quiet", *options
+    )
+    assert status == 2
+    assert len(err.strip().splitlines()) == 1
+    assert "degrees from view to view, expected a helix" in err and "use method 'fbp'" in err
+    assert not list(tmp_path.iterdir())
