@@ -37,6 +37,13 @@ def align(
             help="Reference scan: some views again, taken so quickly that nothing moved.",
         ),
     ] = None,
+    autofocus: Annotated[
+        bool,
+        typer.Option(
+            "--autofocus",
+            help="First find the column of the axis and the tilt of the panel.",
+        ),
+    ] = False,
     schedule: Annotated[
         str,
         typer.Option(
@@ -79,14 +86,17 @@ def align(
       clra align scan.nxs -o motion.h5 --method imgr --volume volume.h5
       clra align scan.nxs -o motion.h5 --reference quick.nxs
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
+      clra align scan.nxs -o motion.h5 --autofocus
     """
     from clra.app.arguments import volume_file
     from clra.app.errors import InterruptedCommandError
     from clra.app.findings import Errors, findings_of, summary_of
+    from clra.app.outputs import focus_attributes
     from clra.app.records import Record
     from clra.io.atomic import ensure_writable
     from clra.io.volumes import write_volume
     from clra.methods.alignment import align as align_scan
+    from clra.methods.autofocus import autofocus as find_focus
     from clra.methods.results import AlignmentInterrupted
     from clra.model.grid import default_grid
     from clra.model.schedule import parse_levels, parse_schedule
@@ -107,9 +117,15 @@ def align(
         "estimate": estimate,
         "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
         f"--estimate {estimate} --gauge {gauge}"
-        f"{'' if reference is None else f' --reference {reference}'}{reading.as_typed()}",
+        f"{'' if reference is None else f' --reference {reference}'}"
+        f"{' --autofocus' if autofocus else ''}{reading.as_typed()}",
     }
     with console.progress() as progress:
+        if autofocus:
+            focus = find_focus(opened, console.device, progress=progress, **limits)
+            about |= focus_attributes(focus)
+            opened = focus.applied(opened)
+            still = still and focus.applied(still)
         try:
             result = align_scan(
                 opened,
@@ -181,7 +197,7 @@ def correct(
 
     limits = memory.limits()
     opened = reading.scan(scan)
-    known = motion_for(opened, motion)
+    opened, known = motion_for(opened, motion)
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns)
     with console.progress() as progress:
@@ -217,7 +233,7 @@ def report(
       clra report motion.h5 -o report.html --scan scan.nxs
     """
     from clra.app.findings import findings_of
-    from clra.app.outputs import check_match
+    from clra.app.outputs import matched
     from clra.app.records import Record
     from clra.app.report import write_report
     from clra.io.atomic import ensure_writable
@@ -227,7 +243,7 @@ def report(
     ensure_writable(out)
     opened = None if scan is None else reading.scan(scan)
     if opened is not None:
-        check_match(opened, record, motion)
+        opened = matched(opened, record, motion)
     with console.progress() as progress:
         findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
     write_report(out, findings)

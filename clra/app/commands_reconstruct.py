@@ -122,7 +122,9 @@ def reconstruct(
     if options.get("initial") not in (None, "fbp", "uniform"):
         options["initial"] = _start(Path(options["initial"]), grid)
     sorted_options(method, options)
-    known = None if motion is None else motion_for(opened, motion)
+    known = None
+    if motion is not None:
+        opened, known = motion_for(opened, motion)
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx)
     steps: tuple[Step, ...] = ()

@@ -183,6 +183,13 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
         "magnification": f"{least:.5f} to {most:.5f}",
         "confidence": f"median {np.median(confidence):.3f}, {len(record.flagged)} views flagged",
     }
+    if "panel_offset_u" in record.about:
+        offset, tilt = (record.about[name] for name in ("panel_offset_u", "panel_tilt"))
+        values |= {"panel_offset_u": offset, "panel_tilt": tilt}
+        lines["panel"] = (
+            f"axis {offset} aside, image turned by {tilt}; slices sharper by a factor of "
+            f"{record.about.get('panel_sharpening', '?')}"
+        )
     if "source_travel" in record.about:
         values["source_travel"] = lines["source"] = record.about["source_travel"]
     if errors:

@@ -1,9 +1,11 @@
 """Checks before long work: that the result can be written, and that its inputs fit each other."""
 
 import errno
+import math
 import os
 import shutil
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 from clra.app.records import Record
@@ -11,6 +13,7 @@ from clra.io.atomic import ensure_writable
 from clra.io.errors import InputError, OutputError
 from clra.io.motions import read_motion_file
 from clra.io.scans import scan_checksum
+from clra.methods.autofocus import Focus
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 
@@ -37,8 +40,8 @@ def room_for(path: str | os.PathLike[str], size: int) -> None:
         raise OutputError.writing(path, errno.ENOSPC, found)
 
 
-def motion_for(scan: Scan, path: str | os.PathLike[str]) -> Motion:
-    """Read the motion of a scan.
+def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion]:
+    """Read the motion of a scan, and take the panel as the alignment took it.
 
     Parameters
     ----------
@@ -46,6 +49,13 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> Motion:
         That it has to fit.
     path : path-like
         MOTION.h5.
+
+    Returns
+    -------
+    scan : Scan
+        With the panel moved and turned as an auto-focus found it, if there was one.
+    motion : Motion
+        Relative to that.
 
     Raises
     ------
@@ -55,12 +65,38 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> Motion:
     """
     file = read_motion_file(path)
     _check(scan, file.motion, file.attributes.get("checksum", ""), path)
-    return file.motion
+    return focused(scan, file.attributes, path), file.motion
 
 
-def check_match(scan: Scan, record: Record, path: str | os.PathLike[str]) -> None:
-    """Check that an alignment and a scan belong together, as :func:`motion_for` does."""
+def matched(scan: Scan, record: Record, path: str | os.PathLike[str]) -> Scan:
+    """Check that an alignment and a scan belong together, and return the scan as aligned.
+
+    As :func:`motion_for` does.
+    """
     _check(scan, record.motion, record.about.get("checksum", ""), path)
+    return focused(scan, record.about, path)
+
+
+def focus_attributes(focus: Focus) -> dict[str, str]:
+    """Write down what an auto-focus found, for :func:`focused`."""
+    return {
+        "panel_offset_u": f"{focus.offset_u:.6g} pixel",
+        "panel_tilt": f"{math.degrees(focus.tilt):.6g} degree",
+        "panel_sharpening": f"{focus.sharpening:.4g}",
+    }
+
+
+def focused(scan: Scan, attributes: Mapping[str, str], path: str | os.PathLike[str]) -> Scan:
+    """Take the panel of a scan as the attributes of a motion file say."""
+    if "panel_offset_u" not in attributes:
+        return scan
+    names = ("panel_offset_u", "panel_tilt", "panel_sharpening")
+    try:
+        offset, tilt, sharpening = (float(attributes[name].split()[0]) for name in names)
+    except (KeyError, ValueError, IndexError):
+        found = ", ".join(repr(attributes.get(name)) for name in names)
+        raise InputError.at(path, "/@panel", found, "a number in each of them") from None
+    return Focus(offset, math.radians(tilt), sharpening).applied(scan)
 
 
 def _check(scan: Scan, motion: Motion, checksum: str, path: str | os.PathLike[str]) -> None:

@@ -13,9 +13,11 @@ from clra.app.simulate import sample
 from clra.io.motions import write_motion_file
 from clra.io.scans import read_scan, write_scan
 from clra.io.volumes import read_volume
+from clra.methods.autofocus import Focus
 from clra.methods.results import AlignmentInterrupted
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
+from clra.model.panel import with_panel
 from clra.model.scan import Scan
 
 COMMANDS = (
@@ -183,6 +185,22 @@ def test_align_to_a_reference_scan(clra, scan, scan_file, tmp_path):
         assert "--method reference" in file.attrs["command"]
         assert f"--reference {quick}" in file.attrs["command"]
     refused(clra("align", scan_file, "-o", motion, "--method", "reference"), 2, "reference")
+
+
+def test_an_auto_focus_goes_with_the_motion(clra, monkeypatch, scan_file, tmp_path):
+    geometry = with_panel(read_scan(scan_file).geometry, offset_u=2.0, tilt=0.01)
+    monkeypatch.setattr("clra.methods.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25))
+    motion, fixed = tmp_path / "motion.h5", tmp_path / "fixed.nxs"
+    code, out, err = clra("align", scan_file, "-o", motion, "--schedule", "1HR", "--autofocus")
+    assert code == 0, err
+    assert "axis 2 pixel aside, image turned by 0.572958 degree" in out
+    assert clra("correct", scan_file, "--motion", motion, "-o", fixed)[0] == 0
+    np.testing.assert_allclose(
+        read_scan(fixed).geometry.u, geometry.u, atol=1e-6 * np.abs(geometry.u).max()
+    )
+    with h5py.File(motion, "r+") as file:
+        file.attrs["panel_tilt"] = "much"
+    refused(clra("correct", scan_file, "--motion", motion, "-o", fixed), 2, "@panel", "much")
 
 
 def test_align_reconstruct_correct_report(clra, scan_file, tmp_path):
