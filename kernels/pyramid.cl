@@ -73,6 +73,8 @@ kernel void restrict_3d(
         store_unaligned(0.125f * sum, coarse);
         return;
     }
+// A few columns at the end: made vectors of, they would take a GPU's registers.
+#pragma clang loop vectorize(disable) unroll(disable)
     for (int c = 0; c < columns - i; ++c) {
         const int a = 2 * c, b = 2 * c + 1;
         coarse[c] = 0.125f * (fine[a] + fine[b] + (right[a] + right[b])

@@ -11,12 +11,15 @@
 // moves on). Coordinates are pixels from the centre of the first; c is the panel's centre. `state`
 // keeps STATE floats a view, see registration.clh.
 
+#ifndef GROUP
+#define GROUP 1 // work-items of one block of rows: 1 on CPUs, 64 on GPUs
+#endif
+#if GROUP > 1
+#define LANES 1
+#endif
+
 #include "unaligned.clh"
 #include "registration.clh"
-
-#ifndef GROUP
-#define GROUP 1 // work-items that share the lines of one block of rows: 1 on CPUs, 32 on GPUs
-#endif
 
 // Start of every view: the coarse shift or none; views without signal are done at once.
 // One work-item a view. Level: the largest of the wide image on a grid of up to 16 x 16 points; a
@@ -77,10 +80,102 @@ kernel void start(
     estimates[9] = unknown_magnification;
 }
 
+// sums that one of several work-items makes
+#define MINE ((SUMS + GROUP - 1) / GROUP)
+
+// A view's images and where it stands.
+typedef struct {
+    global const float *coefficients; // lined (rows, stride): of B
+    global const float *measured; // lined (BLURS, most_views, rows, stride), at the view: A_k
+    global const float *window; // lined (rows, stride): w
+    global const float *valid; // lined (rows, stride): 1 where B may be used, else 0
+    ulong blur; // elements from one A_k to the next
+    int rows, columns, stride;
+    float2 shift;
+    float growth; // 1/m - 1
+    float inverse_radius; // 1/h, 1/pixels
+} twins;
+
+// The spline and its derivatives along x and y, u and f past the second of four by four
+// coefficients, whose first are those of column x - 1 and row y - 1.
+__attribute__((always_inline)) static inline void
+spline_at(const twins s, const int x, const int y, const floatn u, const float f, floatn *b,
+          floatn *p, floatn *q)
+{
+    *b = *p = *q = 0.0f;
+#if GROUP == 1
+    const float wy[4] = SPLINE(f, 1.0f - f), sy[4] = SPLINE_SLOPE(f, 1.0f - f);
+    const floatn wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
+    for (int k = 0; k < 4; ++k) {
+        floatn value = 0.0f, slope = 0.0f;
+        for (int l = 0; l < 4; ++l) {
+            const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
+            const floatn c = load_unaligned(s.coefficients + line + k);
+            value += wy[l] * c;
+            slope += sy[l] * c;
+        }
+        *b += wx[k] * value;
+        *p += sx[k] * value;
+        *q += wx[k] * slope;
+    }
+#else // one weight after the other: sixteen would take a GPU's registers
+#pragma unroll 1
+    for (int k = 0; k < 4; ++k) {
+        float value = 0.0f, slope = 0.0f, weight, decline;
+#pragma unroll 1
+        for (int l = 0; l < 4; ++l) {
+            const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
+            const float c = s.coefficients[line + k];
+            weight = spline_weight(f - (l - 1), &decline);
+            value += weight * c;
+            slope += decline * c;
+        }
+        weight = spline_weight(u - (k - 1), &decline);
+        *b += weight * value;
+        *p += decline * value;
+        *q += weight * slope;
+    }
+#endif
+}
+
+// The terms of LANES pixels from (j, i) on; returns w. Each group of LANES columns takes the
+// spline's piece under its middle: in the outer ones the point lies up to LANES/2 |1/m - 1| beyond
+// the knot, where the piece differs from its neighbour by the cube of that only. So no lane loads
+// from an address of its own.
+__attribute__((always_inline)) static inline floatn
+terms_at(const twins s, const int j, const int i, floatn term[TERMS])
+{
+    const float2 centre = 0.5f * (float2)(s.columns - 1, s.rows - 1);
+    // Displacements, not positions, are interpolated at: they keep all their digits.
+    const float distance_v = (j - centre.y - s.shift.y) * (1.0f + s.growth);
+    const float dy = (j - centre.y) * s.growth - s.shift.y * (1.0f + s.growth);
+    const int y = j + (int)floor(dy), nearest = j + (int)floor(dy + 0.5f);
+    const float f = dy - floor(dy);
+    const float middle =
+        (i + 0.5f * (LANES - 1) - centre.x) * s.growth - s.shift.x * (1.0f + s.growth);
+    // Far outside the panel all is 0 anyway.
+    const int x = clamp(i + (int)floor(middle), -LANES - 4, s.columns + 3);
+    const floatn lanes = load_lanes(lane_numbers);
+    const floatn u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * s.growth;
+    floatn b, p, q;
+    spline_at(s, x, y, u, f, &b, &p, &q);
+    const floatn distance_u = (i - centre.x - s.shift.x + lanes) * (1.0f + s.growth);
+    term[0] = p;
+    term[1] = q;
+    term[2] = (p * distance_u + q * distance_v) * s.inverse_radius;
+    term[3] = b;
+    term[4] = 1.0f;
+    const int near = x + (middle - floor(middle) >= 0.5f);
+    const int line = clamp(nearest, 0, s.rows - 1) * s.stride + MARGIN;
+    const float used = nearest >= 0 && nearest < s.rows;
+    return used * load_unaligned(s.window + j * s.stride + MARGIN + i) *
+           load_unaligned(s.valid + line + near);
+}
+
 // Sums of the normal equations over blocks of rows. Work-group (GROUP, 1, 1), global size
-// (GROUP, blocks, views). Each group of LANES columns takes the spline's piece under its middle: in
-// the outer ones the point lies up to LANES/2 |1/m - 1| beyond the knot, where the piece differs
-// from its neighbour by the cube of that only. So no lane loads from an address of its own.
+// (GROUP, blocks, views). On a CPU a work-item keeps all sums in its registers. A GPU's would not
+// hold them: there each work-item makes the terms of one pixel, and when all are there each makes
+// one of the sums.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     global float *restrict sums, // (views, blocks, SUMS)
     const ulong sums_offset,
@@ -106,92 +201,78 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     const float inverse_radius, // 1/h, 1/pixels
     const int views)
 {
-    sums += sums_offset;
-    measured += measured_offset;
-    coefficients += coefficients_offset;
-    window += window_offset;
-    valid += valid_offset;
-    state += state_offset;
-    const int item = get_local_id(0), block = get_global_id(1), view = get_global_id(2);
-    state += view * STATE;
+    const int block = get_global_id(1), view = get_global_id(2);
+    state += state_offset + view * STATE;
     if (state[DONE] != 0.0f)
         return; // the whole work-group leaves
 
-    const float2 shift = (float2)(state[SHIFT_U], state[SHIFT_V]);
-    const float growth = -state[GROWTH] / (1.0f + state[GROWTH]); // 1/m - 1
-    const float2 centre = 0.5f * (float2)(columns - 1, rows - 1);
-    const ulong first_line = (ulong)view * rows, blur = (ulong)most_views * rows * stride;
+    const twins s = {
+        coefficients + coefficients_offset + (ulong)view * rows * stride,
+        measured + measured_offset + (ulong)view * rows * stride,
+        window + window_offset,
+        valid + valid_offset,
+        (ulong)most_views * rows * stride,
+        rows,
+        columns,
+        stride,
+        (float2)(state[SHIFT_U], state[SHIFT_V]),
+        -state[GROWTH] / (1.0f + state[GROWTH]),
+        inverse_radius};
+    const int start = top + block * block_rows, stop = min(bottom, start + block_rows);
+    sums += sums_offset + ((ulong)view * get_global_size(1) + block) * SUMS;
+    floatn term[TERMS];
+#if GROUP == 1
     floatn sum[SUMS];
     for (int k = 0; k < SUMS; ++k)
         sum[k] = 0.0f;
-
-    const int start = top + block * block_rows, stop = min(bottom, start + block_rows);
-    for (int j = start; j < stop; ++j) {
-        // Displacements, not positions, are interpolated at: they keep all their digits.
-        const float distance_v = (j - centre.y - shift.y) * (1.0f + growth);
-        const float dy = (j - centre.y) * growth - shift.y * (1.0f + growth);
-        const int y = j + (int)floor(dy), nearest = j + (int)floor(dy + 0.5f);
-        if (nearest < 0 || nearest >= rows)
-            continue;
-        const float f = dy - floor(dy);
-        const float wy[4] = SPLINE(f, 1.0f - f), sy[4] = SPLINE_SLOPE(f, 1.0f - f);
-        global const float *line[4];
-        for (int k = 0; k < 4; ++k)
-            line[k] = coefficients +
-                      (first_line + clamp(y - 1 + k, 0, rows - 1)) * stride + MARGIN;
-
-        for (int i = left + item * LANES; i < right; i += GROUP * LANES) {
-            const float middle = (i + 0.5f * (LANES - 1) - centre.x) * growth -
-                                 shift.x * (1.0f + growth);
-            // Far outside the panel all is 0 anyway.
-            const int x = clamp(i + (int)floor(middle), -LANES - 4, columns + 3);
-            const floatn lanes = load_lanes(lane_numbers);
-            const floatn u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * growth;
-            const floatn wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
-            floatn b = 0.0f, p = 0.0f, q = 0.0f;
-            for (int k = 0; k < 4; ++k) {
-                floatn value = 0.0f, slope = 0.0f;
-                for (int l = 0; l < 4; ++l) {
-                    const floatn c = load_unaligned(line[l] + x - 1 + k);
-                    value += wy[l] * c;
-                    slope += sy[l] * c;
-                }
-                b += wx[k] * value;
-                p += sx[k] * value;
-                q += wx[k] * slope;
-            }
-            const floatn distance_u = (i - centre.x - shift.x + lanes) * (1.0f + growth);
-            const floatn s = (p * distance_u + q * distance_v) * inverse_radius;
-            const int near = x + (middle - floor(middle) >= 0.5f);
-            const floatn w = load_unaligned(window + (ulong)j * stride + MARGIN + i) *
-                             load_unaligned(valid + (ulong)nearest * stride + MARGIN + near);
-            floatn term[TERMS] = {p, q, s, b, 1.0f};
+    for (int j = start; j < stop; ++j)
+        for (int i = left; i < right; i += LANES) {
+            const floatn w = terms_at(s, j, i, term);
             for (int k = 0; k < BLURS; ++k)
-                term[5 + k] = load_unaligned(measured + k * blur + (first_line + j) * stride +
-                                             MARGIN + i);
+                term[5 + k] = load_unaligned(s.measured + k * s.blur + j * stride + MARGIN + i);
             for (int k = 0, at = 0; k < TERMS; ++k) {
                 const floatn weighted = w * term[k];
                 for (int other = k; other < TERMS; ++other, ++at)
                     sum[at] += weighted * term[other];
             }
         }
-    }
-
-    sums += ((ulong)view * get_global_size(1) + block) * SUMS;
-#if GROUP == 1
     for (int k = 0; k < SUMS; ++k)
         sums[k] = sum_lanes(sum[k]);
 #else
-    local float shared[SUMS][GROUP];
-    for (int k = 0; k < SUMS; ++k)
-        shared[k][item] = sum_lanes(sum[k]);
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (int k = item; k < SUMS; k += GROUP) {
-        float total = shared[k][0];
-        for (int other = 1; other < GROUP; ++other)
-            total += shared[k][other];
-        sums[k] = total;
+    local float shared[TERMS * GROUP];
+    const int item = get_local_id(0), width = right - left;
+    // the two terms of each of this work-item's sums, one of 36 or more work-items
+    int one[MINE], other[MINE];
+    float sum[MINE];
+    for (int n = 0; n < MINE; ++n) {
+        one[n] = 0;
+        other[n] = item + n * GROUP;
+        for (; one[n] < TERMS && other[n] >= TERMS - one[n]; ++one[n])
+            other[n] -= TERMS - one[n];
+        other[n] += one[n];
+        sum[n] = 0.0f;
     }
+    for (int first = 0; first < (stop - start) * width; first += GROUP) {
+        const int pixel = min(first + item, (stop - start) * width - 1);
+        const int j = start + pixel / width, i = left + pixel % width;
+        const float w = terms_at(s, j, i, term);
+        const float root = first + item == pixel ? sqrt(w) : 0.0f;
+        for (int k = 0; k < 5; ++k)
+            shared[k * GROUP + item] = root * term[k];
+        global const float *blurred = s.measured + (j * stride + MARGIN + i);
+        for (int k = 0; k < BLURS; ++k, blurred += s.blur)
+            shared[(5 + k) * GROUP + item] = root * *blurred;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int n = 0; n < MINE; ++n)
+            if (one[n] < TERMS)
+#pragma unroll 1
+                for (int k = 0; k < GROUP; ++k)
+                    sum[n] += shared[one[n] * GROUP + k] * shared[other[n] * GROUP + k];
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+    for (int n = 0; n < MINE; ++n)
+        if (one[n] < TERMS)
+            sums[item + n * GROUP] = sum[n];
 #endif
 }
 
@@ -202,7 +283,7 @@ kernel void advance(
     const ulong state_offset,
     global float *restrict estimates, // (views, FIELDS)
     const ulong estimates_offset,
-    global const float *restrict sums, // (views, blocks, SUMS)
+    global float *restrict sums, // (views, blocks, SUMS), the first block's are used up
     const ulong sums_offset,
     global const float *restrict levels, // (views, 2)
     const ulong levels_offset,
@@ -236,8 +317,9 @@ kernel void advance(
         return;
     estimates += view * FIELDS;
     sums += (ulong)view * blocks * SUMS;
-    float moments[TERMS][TERMS], mean[TERMS];
-    const float weight = centre_moments(sums, blocks, moments, mean);
+    volatile global float *moments = sums;
+    float mean[TERMS];
+    const float weight = centre_moments(moments, blocks, mean);
 
     const float floor_a = 1e-5f * levels[2 * view], floor_b = 1e-5f * levels[2 * view + 1];
     float mix[BLURS];
@@ -246,16 +328,16 @@ kernel void advance(
     for (int k = 0; k < BLURS; ++k) {
         mean_a += mix[k] * mean[5 + k];
         for (int i = 0; i < 4; ++i)
-            target[i] += mix[k] * moments[i][5 + k];
+            target[i] += mix[k] * moments[OF(i, 5 + k)];
         for (int l = 0; l < BLURS; ++l) {
-            energy += mix[k] * mix[l] * moments[5 + min(k, l)][5 + max(k, l)];
+            energy += mix[k] * mix[l] * moments[OF(5 + min(k, l), 5 + max(k, l))];
             white += mix[k] * mix[l] * noise[BLURS * k + l];
         }
     }
-    const float correlation = target[3] * rsqrt(energy * moments[3][3]);
+    const float correlation = target[3] * rsqrt(energy * moments[OF(3, 3)]);
     // Every comparison is false for NaN, so that whatever is not a number ends here.
-    if (!(moments[5][5] > floor_a * floor_a * weight &&
-          moments[3][3] > floor_b * floor_b * weight && isfinite(correlation))) {
+    if (!(moments[OF(5, 5)] > floor_a * floor_a * weight &&
+          moments[OF(3, 3)] > floor_b * floor_b * weight && isfinite(correlation))) {
         state[DONE] = 1.0f;
         return;
     }
@@ -282,17 +364,17 @@ kernel void advance(
 
     // Columns scaled: gradients by their common size, so that a direction that has none stays
     // where it is (see the term added to the diagonal), B by its own.
-    const float gradient = rsqrt(fmax(moments[0][0], moments[1][1]));
-    const float scale[4] = {gradient, gradient, gradient, rsqrt(moments[3][3])};
+    const float gradient = rsqrt(fmax(moments[OF(0, 0)], moments[OF(1, 1)]));
+    const float scale[4] = {gradient, gradient, gradient, rsqrt(moments[OF(3, 3)])};
     float a[4][4], b[4], x[4];
     for (int i = 0; i < 4; ++i) {
         b[i] = target[i] * scale[i];
         for (int j = 0; j <= i; ++j)
-            a[i][j] = moments[j][i] * scale[i] * scale[j];
+            a[i][j] = moments[OF(j, i)] * scale[i] * scale[j];
         a[i][i] += i < 3 ? 1e-5f : 0.0f;
     }
     // The prior on x2 = -g h dm/m, with the gain of this round.
-    const float lever = target[3] / moments[3][3] * radius;
+    const float lever = target[3] / moments[OF(3, 3)] * radius;
     const float pull = doubt * energy / (lever * lever);
     a[2][2] += pull * scale[2] * scale[2];
     b[2] += pull * lever * grown * scale[2];

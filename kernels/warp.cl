@@ -85,6 +85,7 @@ kernel void prefilter_rows(
     floatn sum = taps[0] * load_unaligned(image + (ulong)j * columns);
     if (j >= TAPS && j + TAPS < rows) {
         global const float *above = image + (ulong)j * columns, *below = above;
+#pragma unroll 4 // all 14 would take a GPU's registers
         for (int k = 1; k <= TAPS; ++k) {
             above -= columns;
             below += columns;

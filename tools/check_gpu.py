@@ -43,7 +43,7 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "multigrid.cl": (64, {}),
     "pibackproject.cl": (256, {"LANES": 1, "BLOCK": 1}),
     "pyramid.cl": (128, {"LANES": 2}),
-    "registration.cl": (32, {"LANES": 2, "GROUP": 32}),
+    "registration.cl": (64, {"GROUP": 64}),
     "transmission.cl": (64, {}),
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),

@@ -196,8 +196,10 @@ class Registration:
         noise = 1 / (2 * math.pi * np.add.outer(variances, variances + 2 * low_pass**2))
         self._noise = to_device(context, noise)
 
-        self._group = group(context, "registration.cl", "normal_equations", 32)
-        defines = {"LANES": lanes(context), "GROUP": self._group}
+        self._group = group(context, "registration.cl", "normal_equations", 64)
+        defines = {"GROUP": self._group}
+        if self._group == 1:
+            defines["LANES"] = lanes(context)
         self._steps = {
             name: Step(context, "registration.cl", name, local, defines)
             for name, local in (
