@@ -28,16 +28,17 @@ def test_devices_are_listed_and_can_be_chosen_by_what_is_listed(context):
 
 
 def test_unknown_device_lists_what_was_found():
-    with pytest.raises(opencl.NoDeviceError, match=r"no OpenCL device 'voodoo'; found 0:0 "):
+    with pytest.raises(opencl.NoDeviceError, match=r"no OpenCL device 'voodoo'; found \d+:0 "):
         opencl.choose_device("voodoo")
 
 
 def test_argument_beats_clra_device_beats_pyopencl_ctx(monkeypatch):
     monkeypatch.setenv("PYOPENCL_CTX", "nothing like it")
-    monkeypatch.setenv("CLRA_DEVICE", "0:0")
-    assert opencl.choose_device() == opencl.choose_device("0:0")
+    first = opencl.devices()[0].index
+    monkeypatch.setenv("CLRA_DEVICE", first)
+    assert opencl.choose_device() == opencl.choose_device(first)
     monkeypatch.setenv("CLRA_DEVICE", "also nothing")
-    assert opencl.choose_device("0:0")
+    assert opencl.choose_device(first)
     with pytest.raises(opencl.NoDeviceError, match="also nothing"):
         opencl.choose_device()
     monkeypatch.delenv("CLRA_DEVICE")
