@@ -2,6 +2,7 @@
 
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -56,6 +57,26 @@ def test_in_a_foreign_context_and_queue_which_it_leaves_as_they_are(case, contex
     assert queue.context == theirs
     del operator
     assert settles(lambda: queue.reference_count == references)
+
+
+@pytest.mark.parametrize("cpu", [True, False])
+def test_a_call_makes_flushes_and_finishes_no_queue(case, context, queue, monkeypatch, cpu):
+    monkeypatch.setattr(opencl, "is_cpu", lambda device: cpu)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*transforms run on the host")  # see test_every_kernel
+        operator = case.run(case.make(context))
+    arrays = [case.empty(queue), *(cl_array.to_device(queue, host) for host in case.inputs)]
+    done = []
+
+    def noted(name: str) -> Callable[..., Any]:
+        return lambda *arguments, **named: done.append(name)
+
+    with monkeypatch.context() as patch:
+        for name in ("flush", "finish", "__init__"):
+            patch.setattr(cl.CommandQueue, name, noted(name))
+        event = operator(queue, *arrays)
+    event.wait()
+    assert done == []
 
 
 def test_out_of_order_it_waits_for_what_it_is_told(case, context, expected):
