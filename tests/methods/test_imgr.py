@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import clra
-from clra.methods.imgr import imgr
+from clra.methods.imgr import imgr, sampled
 from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.osem_tr import OrderedSubsets
 from clra.methods.residuals import between, residuals
@@ -214,6 +214,13 @@ def test_simulated_radiographs_follow_the_motion(rock, geometry, truth, grid, st
         moved=between(other(truth), truth, geometry.shape, 1),
     )
     assert np.sqrt(np.mean(left.read(slice(0, VIEWS)) ** 2)) < 0.03 * apart
+
+
+def test_few_views_are_believed_less(geometry, grid):
+    assert sampled(geometry, grid) == 1
+    few = geometry.subset(slice(None, None, 16))
+    assert sampled(few, grid) == pytest.approx(sampled(few, grid.binned(2)) / 2, rel=0.1)
+    assert sampled(few, grid) < 0.2
 
 
 def test_bad_options_are_refused(scan, grid, stream):
