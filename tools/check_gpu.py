@@ -43,17 +43,16 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "multigrid.cl": (64, {}),
     "pibackproject.cl": (256, {"LANES": 1, "BLOCK": 1}),
     "pyramid.cl": (128, {"LANES": 2}),
-    "registration.cl": (64, {"GROUP": 64}),
+    "registration.cl": (1, {}),
+    "registration_sums.cl": (64, {"GROUP": 64}),
     "transmission.cl": (64, {}),
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),
 }
 # Kernels that run in other groups than the rest of their file.
 WORK_GROUPS: Mapping[str, int] = {
-    "advance": 1,
     "coverage": 16,
     "halve": 32,
-    "start": 1,
     "weigh_rays": 64,
     "windowed": 128,
 }

@@ -196,18 +196,14 @@ class Registration:
         noise = 1 / (2 * math.pi * np.add.outer(variances, variances + 2 * low_pass**2))
         self._noise = to_device(context, noise)
 
-        self._group = group(context, "registration.cl", "normal_equations", 64)
+        sums = ("registration_sums.cl", "normal_equations")
+        self._group = group(context, *sums, 64)
         defines = {"GROUP": self._group}
         if self._group == 1:
             defines["LANES"] = lanes(context)
-        self._steps = {
-            name: Step(context, "registration.cl", name, local, defines)
-            for name, local in (
-                ("start", (1,)),
-                ("normal_equations", (self._group, 1, 1)),
-                ("advance", (1,)),
-            )
-        }
+        self._normal_equations = Step(context, *sums, (self._group, 1, 1), defines)
+        self._start = Step(context, "registration.cl", "start", (1,))
+        self._advance = Step(context, "registration.cl", "advance", (1,))
         self._nothing = to_device(context, np.zeros(views))
         self._last: list[cl.Event] = []
 
@@ -296,7 +292,7 @@ class Registration:
         """Gauss-Newton rounds; views that are done are passed over."""
         n, (rows, columns), stride = len(estimates), self.shape, self._bandpass.stride
         radius, unknown = 0.5 * math.hypot(rows, columns), float(max(rows, columns))
-        event = self._steps["start"](
+        event = self._start(
             queue,
             (n,),
             *(self._state, estimates, self._levels, self._shifts),
@@ -306,7 +302,7 @@ class Registration:
         )
         # One more than there are steps: the last one is judged too.
         for _ in range(self._iterations + 1):
-            event = self._steps["normal_equations"](
+            event = self._normal_equations(
                 queue,
                 (self._group, self._blocks, n),
                 *(self._sums, self._mixed, self._views, self._simulated, self._window),
@@ -314,7 +310,7 @@ class Registration:
                 *(1 / radius, n),
                 wait_for=[event],
             )
-            event = self._steps["advance"](
+            event = self._advance(
                 queue,
                 (n,),
                 *(self._state, estimates, self._sums, self._levels, self._blocks, radius),

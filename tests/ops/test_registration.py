@@ -266,7 +266,7 @@ def test_sums_of_the_normal_equations(context, queue, group):
     blocks, block_rows, radius = 4, 5, 0.5 * math.hypot(rows, columns)
     sums = cl_array.zeros(queue, (views, blocks, 36), np.float32)
     defines = {"GROUP": group}
-    Step(context, "registration.cl", "normal_equations", (group, 1, 1), defines)(
+    Step(context, "registration_sums.cl", "normal_equations", (group, 1, 1), defines)(
         queue,
         (group, blocks, views),
         *(sums, to_device(context, mixed), views),
