@@ -18,6 +18,7 @@ from typing import Any
 
 import pyopencl as cl
 from bench_cases import CASES, LONG, Bench, Case, Value
+from bench_first_use import first_use
 from bench_peers import PEERS, Peer, threads
 
 from clra.ops import opencl
@@ -90,7 +91,8 @@ def found(names: Sequence[str]) -> list[Peer]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    everything = CASES | LONG
+    short = CASES | {"first-use": first_use}
+    everything = short | LONG
     parser.add_argument("--only", action="append", choices=everything, metavar="NAME", default=[])
     parser.add_argument("--long", action="store_true", help=f"also {', '.join(LONG)}")
     parser.add_argument("--peer", action="append", choices=PEERS, default=[])
@@ -98,7 +100,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path, metavar="FILE", help="where to write all times")
     given = parser.parse_args()
-    names = given.only or [*CASES, *(LONG if given.long else ())]
+    names = given.only or [*short, *(LONG if given.long else ())]
     peers = found(given.peer)
     columns = [peer.name for peer in peers]
     queue = cl.CommandQueue(opencl.create_context(given.device))

@@ -5,14 +5,11 @@ there.
 """
 
 import math
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -283,6 +280,31 @@ def iteration(bench: Bench) -> Iterator[Value]:
     yield Value("RA iteration", size, "s", {"clra": statistics.median(times)}, {"clra": times})
 
 
+def alignment(bench: Bench) -> Iterator[Value]:
+    """Align at the paper's full size; the radiographs, 6.6 GB, are read from a file."""
+    paper = dict(PAPER)
+    views, step = 3456, math.radians(0.5)
+    geometry = clra.helix(views, angle_step=step, **paper)
+    voxel = paper["pixel_size"] * paper["source_to_axis"] / paper["source_to_detector"]
+    phantom = three_spheres(240 * voxel, 1248 * voxel)
+    moved = geometry.with_motion(random_motion(views, seed=1, shift=(-10.0, 8.0)))
+    grid = clra.VolumeGrid(shape=(960, 480, 480), voxel_size=voxel)  # 1248 with align()'s margin
+    with tempfile.NamedTemporaryFile() as file:
+        shape = (views, *geometry.shape)
+        projections = np.memmap(file.name, np.float32, "w+", shape=shape)
+        for start in range(0, views, 64):
+            projections[start : start + 64] = phantom.line_integrals(moved, start, start + 64)
+        scan = clra.Scan(projections, geometry)
+        begin, begin_processor = time.perf_counter(), time.process_time()
+        clra.align(scan, schedule="1QR-1HR", grid=grid, device=bench.queue.device)
+        seconds = time.perf_counter() - begin
+        processor = time.process_time() - begin_processor
+        del scan, projections
+    size = "paper's helix: 480x480x1248, 3456 views of 928x512"
+    times = {"clra": [seconds]}, {"clra": [processor]}
+    yield Value("1QR-1HR", size, "s", {"clra": seconds}, *times)
+
+
 def scaling(bench: Bench) -> Iterator[Case]:
     """Whether the time of a voxel-view stays the same as volumes and scans grow."""
     for size, views in ((128, 60), (256, 60), (512, 60), (128, 100), (128, 1000), (128, 4000)):
@@ -293,55 +315,6 @@ def scaling(bench: Bench) -> Iterator[Case]:
         yield next(cases)
 
 
-_FIRST_USE = """
-import math, time
-import numpy as np
-import clra
-geometry = clra.circular(16, source_to_axis=100.0, source_to_detector=150.0, pixel_size=0.6,
-                         shape=(64, 64))
-scan = clra.Scan(np.random.default_rng(0).random((16, 64, 64), np.float32), geometry)
-grid = clra.VolumeGrid(shape=(32, 32, 32), voxel_size=0.5)
-start = time.perf_counter()
-result = clra.align(scan, schedule="1HR-1FR", grid=grid)
-clra.reconstruct(scan, grid=grid, motion=result.motion)
-clra.correct(scan, result.motion).read(0, 4)
-print(time.perf_counter() - start, time.process_time())
-"""
-_IMPORT = """
-import time
-start = time.perf_counter()
-import clra
-print(time.perf_counter() - start, time.process_time())
-"""
-
-
-def first_use(bench: Bench) -> Iterator[Value]:
-    """Time what a fresh process pays: import, and kernels' builds with caches empty and filled."""
-
-    def fresh(
-        name: str, size: str, code: str, environment: Mapping[str, str], repeats: int
-    ) -> Value:
-        variables = os.environ | {"CLRA_DEVICE": bench.queue.device.name.strip()} | environment
-        command = [sys.executable, "-c", code]
-        runs = [
-            subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True)
-            for _ in range(repeats)
-        ]
-        seconds, processor = zip(*(map(float, run.stdout.split()) for run in runs), strict=True)
-        median = statistics.median(seconds)
-        return Value(name, size, "s", {"clra": median}, {"clra": seconds}, {"clra": processor})
-
-    yield fresh("import clra", "", _IMPORT, {}, 7)
-    with tempfile.TemporaryDirectory() as folder:
-        names = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
-        caches = {name: str(Path(folder) / name) for name in names}
-        for path in caches.values():
-            Path(path).mkdir()
-        size = "tiny scan aligned, reconstructed, corrected"
-        yield fresh("first use, caches empty", size, _FIRST_USE, caches, 1)
-        yield fresh("first use, caches filled", size, _FIRST_USE, caches, 3)
-
-
 CASES: dict[str, Maker] = {
     "projectors": projectors,
     "helix": helix,
@@ -349,6 +322,5 @@ CASES: dict[str, Maker] = {
     "accuracy": accuracy,
     "filter": ramp_filter,
     "registration": registration,
-    "first-use": first_use,
 }
-LONG: dict[str, Maker] = {"iteration": iteration, "scaling": scaling}
+LONG: dict[str, Maker] = {"iteration": iteration, "scaling": scaling, "alignment": alignment}
