@@ -29,9 +29,9 @@ class AlignmentStep:
     what it finds to the motion that the geometry has absorbed, :meth:`set_geometry`, and call
     again.
 
-    It is :func:`clra.align`'s iteration for somebody who keeps radiographs and volume on the device
-    and writes the loop; :func:`clra.align` cuts both to fit the memory, goes through resolutions,
-    and deals with outliers and with the gauge.
+    It is the paper's iteration for somebody who keeps radiographs and volume on the device and
+    writes the loop; :func:`clra.align` cuts both to fit the memory, corrects each volume by what
+    its re-projections lack, goes through resolutions, and deals with outliers and with the gauge.
 
     Parameters
     ----------
