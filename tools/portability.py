@@ -32,8 +32,7 @@ WHEELS = ("intel-opencl-rt", "intel-cmplr-lib-rt")
 
 KERNELS = "tests/ops/test_every_kernel.py"
 OPERATORS = (KERNELS, "tests/ops/test_embedding.py")
-# What asks most of a device in the least time, and what finds none but this one; all tests take
-# Intel's compiler three minutes.
+# What asks most of a device in the least time, and what finds none but this one; all tests take Intel's compiler three minutes.
 QUICK = (
     "tests/kernels",
     "tests/test_package.py",

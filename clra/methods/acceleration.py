@@ -35,8 +35,16 @@ class Anderson:
     def __init__(self, memory: int = 3, *, floor: float = 0.5) -> None:
         self.memory = memory
         self.floor = floor
-        self._points: list[Floats] = []
-        self._steps: list[Floats] = []
+        self._last: tuple[Floats, Floats] | None = None
+        self._differences: list[tuple[Floats, Floats]] = []
+
+    def restart(self) -> None:
+        """Go on with another f whose differences resemble those of the one before.
+
+        What an iteration at one resolution learnt of slow modes holds at the next one, but the step
+        across says more of the two levels' errors than of either.
+        """
+        self._last = None
 
     def next(self, x: Floats, f: Floats) -> Floats:
         """Return the next point.
@@ -48,12 +56,13 @@ class Anderson:
         f : ndarray
             The plain step from there.
         """
-        self._points = [*self._points, x][-(self.memory + 1) :]
-        self._steps = [*self._steps, f][-(self.memory + 1) :]
-        if len(self._steps) < 2:
+        if self._last is not None:
+            pair = (x - self._last[0]).ravel(), (f - self._last[1]).ravel()
+            self._differences = [*self._differences, pair][-self.memory :] if self.memory else []
+        self._last = x, f
+        if not self._differences:
             return x + f
-        dx = np.diff(np.stack(self._points, axis=-1).reshape(x.size, -1))
-        df = np.diff(np.stack(self._steps, axis=-1).reshape(x.size, -1))
+        dx, df = (np.stack(part, axis=-1) for part in zip(*self._differences, strict=True))
         # Columns of one length: else the damping that the first, long difference needs would
         # drown the last, short ones, which are what slow modes are seen in.
         length = np.linalg.norm(df, axis=0)

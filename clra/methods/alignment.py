@@ -13,19 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.acceleration import Anderson
+from clra.methods.fbp import ramp_fbp
 from clra.methods.imgr import imgr
 from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
 from clra.methods.reference import align_to_reference
-from clra.methods.refinement import refined_fbp
-from clra.methods.reprojection import (
-    Registered,
-    registration_for,
-    reproject_and_register,
-    with_margin,
-)
+from clra.methods.refinement import refine
+from clra.methods.reprojection import Registered, reproject_and_register, with_margin
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
+from clra.methods.solver import Solver
 from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -52,8 +48,8 @@ def align(
     motion: Motion | None = None,
     truth: Motion | None = None,
     progress: Report | None = None,
-    memory: int = 3,
     gauge: str = "anchored",
+    solver: Solver | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> AlignmentResult:
@@ -68,8 +64,9 @@ def align(
         (:func:`clra.methods.imgr.imgr`, Algorithm 3), which returns the volume as well; or the slow
         drift against a reference scan alone, without any reconstruction.
     schedule : str
-        Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": a quarter of
-        the resolution until converged (at most 6 iterations), then one at half. For "imgr" the
+        Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
+        panel of 384 pixels and more "6ER-3QR-1HR", else a quarter of the resolution until converged
+        (at most 6 iterations), then one iteration at half. For "imgr" the
         levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
@@ -88,14 +85,13 @@ def align(
         To report errors against; by default the scan's own, if it is a simulated one.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
-    memory : int
-        Iterations that Anderson acceleration looks back on within a level; 0 for the paper's plain
-        iteration. "imgr" iterates plainly.
     gauge : {"anchored", "free"}
         What becomes of the part of the motion that a movement of the sample as a whole (three
         translations, two tilts, a stretch along z) would explain as well. The data hardly see it,
         and what the iteration finds of it comes from how a cone beam reconstructs the ends of a
         scan: it would go on and stretch the sample. "anchored" takes it out in each iteration.
+    solver : Solver, optional
+        Parts of the iteration, to switch some off; `gauge` says whether it anchors.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 
@@ -119,7 +115,7 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise ValueError(f"reference, motion: found {found}, expected one of them")
-    stages = parse_schedule(schedule) if method == "ra" else ()
+    stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
     stream = Stream(
         device,
         max_device_memory=max_device_memory,
@@ -133,7 +129,8 @@ def align(
             return drift
         motion = drift.motion
     grid = grid or default_grid(scan.geometry)
-    scale, anchor = estimate != "shift", gauge == "anchored"
+    solver = replace(solver or Solver(), anchor=gauge == "anchored")
+    scale = estimate != "shift" and solver.estimator == "gauss-newton"
     start = motion or Motion.identity(scan.views)
     start = start.caused_by("source" if estimate == "source" else "panel")
     if method == "imgr":
@@ -144,11 +141,12 @@ def align(
             levels=schedule,
             align=True,
             scale=scale,
-            anchor=anchor,
+            anchor=solver.anchor,
             motion=start,
             truth=truth,
         )
-    run = _Run(stream, scan, with_margin(grid), schedule, scale, memory, anchor, start)
+    run = _Run(stream, scan, with_margin(grid), schedule, scale, solver, start)
+    run.several = stages != (Stage(stages[0].level, 1, 1),)
     run.truth = truth
     try:
         for stage in stages:
@@ -191,18 +189,20 @@ class _Run:
     grid: VolumeGrid
     schedule: str
     scale: bool
-    memory: int
-    anchor: bool
+    solver: Solver
     start: Motion
+    several: bool = field(init=False, default=True)  # iterations in the schedule
     motion: Motion = field(init=False)
     truth: Motion | None = field(init=False, default=None)
     history: list[Iteration] = field(init=False, default_factory=list)
     registered: Registered = field(init=False)
     found: Motion = field(init=False)  # by the last iteration, with its gauge
     weak: NDArray[np.bool_] = field(init=False)
+    bias: Motion | None = field(init=False)  # of what a level's registrations find
 
     def __post_init__(self) -> None:
         self.motion = self.start
+        self.anderson = self.solver.acceleration()
         points = sample_points(self.grid)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
@@ -216,13 +216,14 @@ class _Run:
         radiographs = Radiographs(self.stream, self.scan, stage.level)
         if not self.history:
             self.weak = odd_radiographs(self.stream, radiographs)
-        anderson = Anderson(self.memory)
+        self.anderson.restart()
+        self.bias = None
         previous = None
         for iteration in range(1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(radiographs, first=not self.history, title=of)
-            update_u, update_v = np.abs(self._move(found, anderson))
+            update_u, update_v = np.abs(self._move(found))
             self.history.append(
                 Iteration(
                     level=name,
@@ -243,43 +244,61 @@ class _Run:
 
     def _iterate(self, radiographs: Radiographs, *, first: bool, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""
-        stream, level = self.stream, radiographs.level
+        stream, level, solver = self.stream, radiographs.level, self.solver
         # Motions are in full-resolution pixels: absorb first, then bin.
         geometry = self.scan.geometry.with_motion(self.motion).binned(level)
+        shifts_only = first and self._shifts_first
+        measure = solver.is_biased(geometry.shape) and self.bias is None and not shifts_only
+        options: dict[str, Any] = {"believed": ~self.weak, "circle": solver.circle}
         # 2: reconstruct from the corrected radiographs
-        volume = refined_fbp(
+        volume = ramp_fbp(
             stream,
             radiographs,
             geometry,
             self.grid.binned(level) if level > 1 else self.grid,
-            believed=~self.weak,
-            stage=title,
-        )
-        registration = registration_for(
-            stream, self.scan, radiographs, first=first, magnification=self.scale
-        )
-        # 3, 4: simulate and register
-        return reproject_and_register(
-            stream,
-            radiographs,
-            volume,
-            geometry,
-            registration,
-            magnification=self.motion.magnification / self.start.magnification,
-            lost=(self.scan.geometry.rows % level, self.scan.geometry.columns % level),
-            stage=f"{title}: registering",
+            stage=f"{title}: reconstructing",
+            volumes=2 if measure else 1,
+            **options,
         )
 
-    def _move(self, found: Registered, anderson: Anderson) -> Floats:
+        # 3, 4: simulate and register
+        def registered() -> Registered:
+            return reproject_and_register(
+                stream,
+                radiographs,
+                volume,
+                geometry,
+                solver.registration(
+                    stream,
+                    self.scan,
+                    radiographs,
+                    first=first,
+                    magnification=self.scale and not shifts_only,
+                ),
+                magnification=self.motion.magnification / self.start.magnification,
+                lost=(self.scan.geometry.rows % level, self.scan.geometry.columns % level),
+                stage=f"{title}: registering",
+            )
+
+        found = registered()
+        if measure:
+            refine(stream, radiographs, volume, geometry, stage=title, **options)
+            self.bias = registered().motion.inverse().then(found.motion)
+        if self.bias is None:
+            return found
+        return replace(found, motion=self.bias.inverse().then(found.motion))
+
+    def _move(self, found: Registered) -> Floats:
         """Algorithm 1, step 5: append what was found; returns the plain step in u and v."""
         self.registered = found
         self.weak = outliers(found.correlation)
-        self.found = from_neighbours(self.motion.then(found.motion), self.weak)
+        self.found = from_neighbours(self.motion.then(found.motion), self.weak).normalised()
+        anchored = self.shift_gauge.anchored(self.found, self.start)
         here = self._as_lengths(self.motion)
-        there = self._as_lengths(
-            self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
-        )
-        moved = anderson.next(here, there - here)
+        there = self._as_lengths(anchored if self.solver.anchor else self.found)
+        # The first step's reconstruction was blurred, and what it registered is not all that later
+        # ones do: nothing to extrapolate from.
+        moved = self.anderson.next(here, there - here) if self.history else there
         half = self._lever
         self.motion = Motion(
             shift_u=moved[0],
@@ -288,6 +307,12 @@ class _Run:
             cause=self.motion.cause,
         ).normalised()
         return np.asarray((there - here)[:2])
+
+    @property
+    def _shifts_first(self) -> bool:
+        """Whether the magnification waits: others follow, and none is known already."""
+        known = bool((self.start.magnification != 1).any())
+        return self.solver.shifts_first and self.several and not known
 
     @property
     def _lever(self) -> float:

@@ -25,6 +25,7 @@ def ramp_fbp(
     believed: NDArray[np.bool_] | None = None,
     stage: str = "back-projecting",
     volumes: int = 1,
+    circle: bool = True,
     planes: slice | None = None,
     target: PlaneWriter | None = None,
 ) -> Volume:
@@ -51,6 +52,8 @@ def ramp_fbp(
         What progress reports call this.
     volumes : int
         How many volumes like this one the device has to hold at a time.
+    circle : bool
+        Leave zero what lies outside the circle that all views see.
     planes : slice, optional
         Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
@@ -78,6 +81,7 @@ def ramp_fbp(
         geometry.subset(chosen),
         grid.slab(near.start, near.stop),
         row_weight,
+        circle=circle,
         allocator=stream.memory,
     )
     coverage.compute(queue)

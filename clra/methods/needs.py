@@ -110,7 +110,7 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
     shared, pixels = budgets.shared, int(np.prod(geometry.shape))
     kept = 4 * geometry.views * pixels if level > 1 else 0
-    # The reconstruction and its correction, see `refined_fbp`.
+    # The reconstruction and its correction, see `refine`.
     slab, volume = _slab(budgets, grid, 2), 4 * int(np.prod(grid.shape))
     cut = slab < volume
     arrays = [kept] + [volume] * 2 * cut

@@ -7,27 +7,27 @@ from numpy.typing import NDArray
 
 from clra.methods.fbp import ramp_fbp
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
 
 
-def refined_fbp(
+def refine(
     stream: Stream,
     radiographs: Radiographs,
+    volume: Volume,
     geometry: ConeBeamGeometry,
-    grid: VolumeGrid,
     *,
     believed: NDArray[np.bool_],
     stage: str,
-) -> Volume:
-    """Reconstruct by ramp-filtered back-projection B and one correction: ``x + B (p - A x)``.
+    circle: bool = True,
+) -> None:
+    """Correct a ramp-filtered back-projection ``x = B p``: it becomes ``x + B (p - A x)``.
 
-    With ``x = B p`` and the projection A. Off circles, and far from their plane, B is no inverse
-    of A, and re-projections of x are displaced by its artefacts: by 0.3 pixel in v for a helix
-    whose views look 34 degrees up and down. The correction, the second term of the Neumann series
-    for the inverse, leaves 0.13 of that; two of them leave 0.09, four 0.05.
+    With the projection A. Off circles, and far from their plane, B is no inverse of A, and
+    re-projections of x are displaced by its artefacts: by 0.3 pixel in v for a helix whose views
+    look 34 degrees up and down. The correction, the second term of the Neumann series for the
+    inverse, leaves 0.13 of that; two of them leave 0.09, four 0.05.
 
     Parameters
     ----------
@@ -35,36 +35,30 @@ def refined_fbp(
         Device and memory budget.
     radiographs : Radiographs
         Line integrals at the resolution of `geometry`.
+    volume : Volume
+        As of :func:`clra.methods.fbp.ramp_fbp` with ``volumes=2``; changed in place.
     geometry : ConeBeamGeometry
         Of those radiographs, with the motion absorbed.
-    grid : VolumeGrid
-        Where to reconstruct.
     believed : ndarray of bool, (views,)
         Views to reconstruct from, at least one.
     stage : str
         What progress reports call this.
-
-    Returns
-    -------
-    Volume
-        Attenuation [1/mm].
+    circle : bool
+        As for :func:`clra.methods.fbp.ramp_fbp`.
     """
-    options: dict[str, Any] = {"believed": believed, "volumes": 2}
-    volume = ramp_fbp(
-        stream, radiographs, geometry, grid, stage=f"{stage}: reconstructing", **options
-    )
     lacking = Scan(_Lacking(stream, radiographs, volume, geometry), geometry)
     correction = ramp_fbp(
         stream,
         Radiographs(stream, lacking, 1),
         geometry,
-        grid,
+        volume.grid,
+        believed=believed,
+        volumes=2,
+        circle=circle,
         stage=f"{stage}: refining",
-        **options,
     )
     for index in range(len(volume.planes)):
         volume.put(index, volume.get(index) + correction.get(index))
-    return volume
 
 
 class _Lacking:

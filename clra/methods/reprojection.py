@@ -11,6 +11,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
+from clra.ops.correlation import PhaseCorrelation
 from clra.ops.registration import ESTIMATE_FIELDS, Registration
 from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
@@ -20,13 +21,22 @@ Floats = NDArray[np.float64]
 # Planes beyond each end of the grid, as a part of its height: views at the ends of a scan look
 # past it, and what they see there has to be in the re-projection too.
 _MARGIN = 0.15
-# Expected standard deviation of log(magnification): the paper's scans stay within 1 +- 0.001. On
-# small panels a slow drift of the magnification along the scan is hardly seen: at twice the value
-# it ends 2e-3 off for 190 columns, at half of it half of what such panels do tell is lost.
-_SPREAD = 5e-4
-# Sigma of the band-pass in pixels of the level, first iteration and later: the first
-# reconstruction is blurred by the motion itself, and its fine detail is not the sample's.
-_FIRST_LOW_PASS, _LOW_PASS, _HIGH_PASS = 2.0, 1.0, 16.0
+# Expected standard deviation of log(magnification), see `Registration`. The paper's scans stay
+# within 1e-3, but pulled so hard slow drifts come out a tenth too small. Small images, whose
+# systematic errors of 0.01 pixel are 1e-3 of their size, have to be held: those with a diagonal
+# below this many pixels by the square of what they lack.
+SPREAD = 3e-3
+_LONG = 110
+# Sigmas of the band-pass in pixels of the level, low and high, first iteration and later: the first
+# reconstruction is blurred by the motion itself, and its fine detail is not the sample's. Ramp-FBP
+# is shaded where it lacks rays, and shading displaces what the band lets through: re-projections of
+# the paper's scans are off by 0.25 pixel in v and 1.5e-3 in magnification with a high sigma of 16,
+# 0.04 and 6e-4 with 8, 0.025 and 2e-4 with 4, no better with 3. Small images, see `_LONG`, hold too
+# few edges for that: with 4 a real scan of 135 x 160 ends at 0.47 pixel in u instead of 0.33.
+_FIRST_BAND, _BAND, _SMALL_BAND = (2.0, 8.0), (1.0, 4.0), (1.0, 8.0)
+
+# An estimate that knows the shift only: magnification, gain and correlation 1, sigmas unknown.
+_SHIFT_ALONE = np.array([0, 0, 1, 1, 0, 1, 0, np.nan, np.nan, np.nan])
 
 
 @dataclass(frozen=True)
@@ -57,7 +67,13 @@ def with_margin(grid: VolumeGrid) -> VolumeGrid:
 
 
 def registration_for(
-    stream: Stream, scan: Scan, radiographs: Radiographs, *, first: bool, magnification: bool
+    stream: Stream,
+    scan: Scan,
+    radiographs: Radiographs,
+    *,
+    first: bool,
+    magnification: bool,
+    spread: float = SPREAD,
 ) -> Registration:
     """Return the estimator for radiographs of a level.
 
@@ -73,18 +89,22 @@ def registration_for(
         Whether the volume is blurred by motion not known yet.
     magnification : bool
         Whether to estimate it.
+    spread : float
+        Its expected spread, as for `Registration`.
     """
     views, rows, columns = radiographs.shape
+    size = min(1.0, float(np.hypot(rows, columns)) / _LONG)
+    low_pass, high_pass = _FIRST_BAND if first else _BAND if size == 1 else _SMALL_BAND
     chunks = stream.chunks(views, radiographs.view_bytes)
     return Registration(
         stream.context,
         (rows, columns),
         views=max(chunk.stop - chunk.start for chunk in chunks),
-        low_pass=_FIRST_LOW_PASS if first else _LOW_PASS,
-        high_pass=_HIGH_PASS,
+        low_pass=low_pass,
+        high_pass=high_pass,
         mask=None if scan.mask is None else binned_mask(scan.mask, radiographs.level),
         magnification=magnification,
-        spread=_SPREAD,
+        spread=spread * size**2,
         allocator=stream.memory,
         # It keeps a pair's images in a dozen forms; the filters' share is free by now.
         scratch_limit=3 * stream.scratch_limit,
@@ -138,7 +158,7 @@ def reprojected(
 
 def register(
     stream: Stream,
-    registration: Registration,
+    registration: Registration | PhaseCorrelation,
     measured: Array,
     simulated: Array,
     magnification: Floats,
@@ -149,7 +169,7 @@ def register(
     ----------
     stream : Stream
         Device.
-    registration : Registration
+    registration : Registration or PhaseCorrelation
         Estimator for radiographs of this size.
     measured, simulated : cl.array.Array
         float32 (n, rows, columns), line integrals.
@@ -159,8 +179,15 @@ def register(
     Returns
     -------
     ndarray, (n, fields)
-        A row a pair, see ``ESTIMATE_FIELDS``.
+        A row a pair, see ``ESTIMATE_FIELDS``; of a phase correlation all but the shifts say
+        nothing.
     """
+    if isinstance(registration, PhaseCorrelation):
+        shifts = stream.empty((len(magnification), 2))
+        registration(stream.queue, shifts, measured, simulated).wait()
+        table = np.tile(_SHIFT_ALONE, (len(magnification), 1))
+        table[:, :2] = stream.download(shifts)
+        return table
     estimates = stream.empty((len(magnification), len(ESTIMATE_FIELDS)))
     known = stream.upload(np.log(magnification).astype(np.float32))
     registration(stream.queue, estimates, measured, simulated, known).wait()
@@ -172,7 +199,7 @@ def reproject_and_register(
     radiographs: Radiographs,
     volume: Volume,
     geometry: ConeBeamGeometry,
-    registration: Registration,
+    registration: Registration | PhaseCorrelation,
     *,
     magnification: Floats,
     lost: tuple[int, int],
@@ -184,7 +211,7 @@ def reproject_and_register(
     ----------
     stream, radiographs, volume, geometry, stage
         As for :func:`reprojected`; what is found comes on top of the motion in `geometry`.
-    registration : Registration
+    registration : Registration or PhaseCorrelation
         Estimator for radiographs of this size.
     magnification : ndarray, (views,)
         That `geometry` has absorbed.

@@ -16,6 +16,14 @@ _EXPECTED = (
     "full (FR), half (HR), quarter (QR) or eighth (ER) resolution, joined by '-'"
 )
 
+# "auto" begins at an eighth of the resolution where the panel's shorter side keeps this many
+# pixels. A fixed number of iterations does: they cost next to nothing there, and slow modes
+# (magnification and v that drift together along the scan) need them. By the paper's count, an
+# eighth 1/64 and a quarter 1/16 of an iteration, one more at each of the two for what their
+# re-projections lack, it is 0.61: 2QR-2HR is 0.625.
+_SMALLEST = 48
+_LARGE = ((8, 6), (4, 3), (2, 1))
+
 # Iterations after which "until converged" gives up: plain re-projection alignment of a slow, smooth
 # motion gains less than a tenth of its error in each further one.
 _LIMIT = 6
@@ -91,14 +99,17 @@ def parse_levels(text: str) -> tuple[int, ...]:
     return factors
 
 
-def parse_schedule(text: str) -> tuple[Stage, ...]:
+def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, ...]:
     """Read a schedule.
 
     Parameters
     ----------
     text : str
-        Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto": quarter resolution
-        until converged (at most 6 iterations), then one iteration at half resolution.
+        Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto": "6ER-3QR-1HR" for
+        large panels, for others quarter resolution until converged (at most 6 iterations), then one
+        iteration at half resolution.
+    shape : (int, int)
+        Rows and columns of the panel, for "auto": large is from 384 on.
 
     Returns
     -------
@@ -111,6 +122,8 @@ def parse_schedule(text: str) -> tuple[Stage, ...]:
         If the text is no schedule; the message says what one looks like.
     """
     if text == "auto":
+        if min(shape) // 8 >= _SMALLEST:
+            return tuple(Stage(level, count, count) for level, count in _LARGE)
         return Stage(_LEVELS["QR"], None, _LIMIT), Stage(_LEVELS["HR"], 1, 1)
     stages = []
     for part in str(text).upper().split("-"):

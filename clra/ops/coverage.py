@@ -1,5 +1,6 @@
 """How many views see each voxel, and volumes divided by that number."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,6 +46,8 @@ class Coverage:
         Of the volume.
     row_weight : array_like, (rows,)
         By which the rows of each projection were multiplied.
+    circle : bool
+        Whether volumes are set to zero outside the circle that all views see.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
@@ -66,6 +69,7 @@ class Coverage:
         grid: VolumeGrid,
         row_weight: ArrayLike,
         *,
+        circle: bool = True,
         allocator: Allocator | None = None,
     ) -> None:
         weights = np.asarray(row_weight, np.float64)
@@ -78,7 +82,7 @@ class Coverage:
         self._panel = (max(geometry.columns, 2), max(geometry.rows, 2))
         nz, ny, nx = grid.shape
         self._coarse = (-(-nx // _ACROSS), -(-ny // _ACROSS), -(-nz // _ALONG))
-        self._row_weight = weights
+        self._row_weight, self._circle = weights, circle
         self._weights = to_device(context, np.resize(weights, self._panel[1]))
         self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
         self.scratch_bytes = self._seen.nbytes
@@ -103,7 +107,7 @@ class Coverage:
         self._matrices = to_device(self._context, self._coarse_matrices(geometry))
         self._least = _LEAST * _most_views(geometry, self._row_weight)
         radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
-        self._radius = radius / self._grid.voxel_size
+        self._radius = radius / self._grid.voxel_size if self._circle else math.inf
 
     def _coarse_matrices(self, geometry: ConeBeamGeometry) -> np.ndarray:
         """Projection matrices from the middles of coarse voxels."""

@@ -20,6 +20,12 @@ def test_text_becomes_stages(text, stages):
     assert parse_schedule(text) == tuple(Stage(*stage) for stage in stages)
 
 
+def test_auto_begins_at_an_eighth_where_that_leaves_something():
+    assert [str(stage) for stage in parse_schedule("auto", (928, 512))] == ["6ER", "3QR", "1HR"]
+    assert parse_schedule("auto", (928, 300)) == parse_schedule("auto")
+    assert parse_schedule("1QR", (928, 512)) == parse_schedule("1QR")
+
+
 @pytest.mark.parametrize(
     "text",
     ["", "QR", "0QR", "1XR", "1QR-", "-1QR", "1QR 1HR", "1QR,1HR", "1.5QR", "100FR", "Auto?"],
