@@ -170,6 +170,8 @@ static inline void scatter(
     }
 }
 
+// Global size as for adjoint_columns.cl: (blocks, nx, ceil(ny / WIDTH)) for axis 0, (blocks, ny,
+// ceil(nx / WIDTH)) for axis 1, rounded up at will.
 kernel void adjoint_tilted(
     global float *restrict volume, // (ny, nx, nz)
     const ulong volume_offset,

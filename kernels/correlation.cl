@@ -74,7 +74,8 @@ kernel void windowed(
     out[((ulong)view * out_rows + j) * out_columns + i] = value;
 }
 
-// measured := measured * conj(simulated), and divided by its modulus if whitened (0 stays 0).
+// measured := measured * conj(simulated), and divided by its modulus if whitened (0 stays 0). Global
+// size (count), rounded up at will.
 kernel void cross_power(
     global float2 *restrict measured, // spectra, (count,)
     const ulong measured_offset,
@@ -170,7 +171,8 @@ static inline floatn every_second(global const float *restrict p)
 }
 
 // Windowed, halved images for the coarse search: the spline midway between four pixels.
-// A work-item makes LANES pixels; beyond the halved image out is filled with 0.
+// A work-item makes LANES pixels; beyond the halved image out is filled with 0. Global size (blocks
+// of LANES columns, out_rows, views), rounded up at will.
 kernel void halve(
     global float *restrict halved, // (views, out_rows, out_columns)
     const ulong halved_offset,

@@ -4,7 +4,8 @@
 // on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It varies over many
 // voxels, so that it is computed once for a block of them and interpolated linearly.
 //
-// coverage: one work-item a coarse voxel. normalise: one a voxel. Ranges may be rounded up.
+// Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
+// normalise one a voxel, along the volume's axes from last to first.
 
 kernel void coverage(
     global float *restrict seen, // W, (ny, nx, nz) of the coarse grid

@@ -32,7 +32,8 @@ WHEELS = ("intel-opencl-rt", "intel-cmplr-lib-rt")
 
 KERNELS = "tests/ops/test_every_kernel.py"
 OPERATORS = (KERNELS, "tests/ops/test_embedding.py")
-# What asks most of a device in the least time, and what finds none but this one; all tests take Intel's compiler three minutes.
+# What asks most of a device in the least time, and what finds none but this one; all tests take
+# several minutes, most of them in Intel's compiler.
 QUICK = (
     "tests/kernels",
     "tests/test_package.py",

@@ -40,6 +40,31 @@ def test_every_buffer_is_followed_by_its_offset():
                     assert following.name == f"{this.name}_offset"
 
 
+# A size that a comment spells out, or the plain rule for kernels of a work-item a view.
+GEOMETRY = re.compile(r"global\s+sizes?\b|one work-item a view", re.IGNORECASE)
+KERNEL = re.compile(r"((?:^//[^\n]*\n)*)^kernel\b[^\n]*\bvoid (\w+)\(", re.MULTILINE)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_comments_tell_the_launch_geometry_of_each_kernel(file):
+    text = (clra.kernels.path() / file).read_text(encoding="utf-8")
+    head = re.match(r"(?://[^\n]*\n){3,}", text)
+    assert head, "no head comment"
+    kernels = KERNEL.findall(text)
+    assert [name for _, name in kernels] == [one.name for one in signatures(file)]
+    for comment, name in kernels:
+        told = re.sub(r"\n//", "", head.group(0) + comment)
+        assert GEOMETRY.search(told), name
+
+
+def test_the_shape_of_every_array_is_told():
+    for file in FILES:
+        for kernel in signatures(file):
+            for argument in kernel.arguments:
+                if argument.type.startswith("global"):
+                    assert argument.meaning, (file, kernel.name, argument.name)
+
+
 def test_header_defines_each_name_once():
     text = header()
     defined = re.findall(r"^#define (\w+)|^    (\w+),?", text, re.MULTILINE)

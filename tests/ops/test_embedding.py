@@ -87,12 +87,13 @@ def test_out_of_order_it_waits_for_what_it_is_told(case, context, expected):
         out = case.empty(queue)  # blocks, until all is done where PoCL is concerned
         late = cl.UserEvent(context)
         inputs = [cl_array.to_device(queue, np.full_like(host, np.nan)) for host in case.inputs]
+        # Started first: if no thread can be, nothing waits for it for ever.
+        timer = threading.Timer(0.03, late.set_status, [cl.command_execution_status.COMPLETE])
+        timer.start()
         arrived = [
             cl.enqueue_copy(queue, array.base_data, host, wait_for=[late], is_blocking=False)
             for array, host in zip(inputs, case.inputs, strict=True)
         ]
-        timer = threading.Timer(0.03, late.set_status, [cl.command_execution_status.COMPLETE])
-        timer.start()
         event = case.run(operator)(queue, out, *inputs, wait_for=arrived)
         timer.join()
         event.wait()
