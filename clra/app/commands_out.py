@@ -150,7 +150,7 @@ def align(
         record.save(out)
         errors = Errors.of(record, opened)
         if volume is not None and result.volume is not None:
-            grid = default_grid(opened.geometry)
+            grid = default_grid(opened.cropped().geometry)
             write_volume(volume, result.volume, grid, progress=progress)
         if report is not None:
             from clra.app.report import write_report
@@ -248,7 +248,8 @@ def report(
     with console.progress() as progress:
         findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
     write_report(out, findings)
-    console.summary({"file": out}, f"wrote {out}")
+    told = {} if findings.quality is None else {"quality": findings.quality}
+    console.summary({"file": out, **told}, f"wrote {out}")
 
 
 def demo(

@@ -118,7 +118,7 @@ def reconstruct(
         raise ValueError(f"--resume: found it with --method {method}, expected imgr")
     options = iterating.options()
     opened = reading.scan(scan)
-    grid = default_grid(opened.geometry)
+    grid = default_grid(opened.cropped().geometry)
     if options.get("initial") not in (None, "fbp", "uniform"):
         options["initial"] = _start(Path(options["initial"]), grid)
     sorted_options(method, options)

@@ -119,7 +119,7 @@ def compare(
         else MultigridSlicer(stream, scan, volume)
     )
     horizontal, vertical = (Pair(*slicer.images(plane)) for plane in _middle_planes(slicer.grid))
-    level = _level(scan, _VOLUME_COLUMNS)
+    level = volume_level(scan)
     radiographs = Radiographs(stream, scan, level)
     return Comparison(
         horizontal=horizontal,
@@ -130,6 +130,11 @@ def compare(
         matches=_matches(stream, radiographs, scan.geometry, motion, confidence),
         pixel_mm=_grid(scan.geometry, level).voxel_size,
     )
+
+
+def volume_level(scan: Scan) -> int:
+    """Binning at which whole volumes are made for a report."""
+    return _level(scan, _VOLUME_COLUMNS)
 
 
 def _level(scan: Scan, columns: int) -> int:

@@ -17,6 +17,7 @@ from clra.model.scan import Scan
 
 if TYPE_CHECKING:
     from clra.app.comparison import Comparison
+    from clra.methods.quality import Quality
     from clra.ops.streaming import Report
 
 Floats = NDArray[np.float64]
@@ -86,12 +87,15 @@ class Findings:
         Pictures, where the scan was at hand.
     facts : mapping of str to str
         Of the scan, for reading.
+    quality : Quality, optional
+        What the radiographs alone tell, where the scan was at hand.
     """
 
     record: Record
     errors: Errors | None = None
     comparison: "Comparison | None" = None
     facts: Mapping[str, str] = field(default_factory=dict)
+    quality: "Quality | None" = None
 
 
 def findings_of(
@@ -123,7 +127,8 @@ def findings_of(
     """
     if scan is None:
         return Findings(record)
-    from clra.app.comparison import compare
+    from clra.app.comparison import compare, volume_level
+    from clra.methods.quality import quality
     from clra.ops.streaming import Stream
 
     stream = Stream(
@@ -132,10 +137,13 @@ def findings_of(
         max_host_memory=max_host_memory,
         report=progress,
     )
+    part = scan.cropped()
+    motion = record.motion.about(*scan.window_aside)
     return Findings(
         record,
         errors=Errors.of(record, scan),
-        comparison=compare(stream, scan, record.motion, record.confidence, volume),
+        comparison=compare(stream, part, motion, record.confidence, volume),
+        quality=quality(stream, part, motion, volume_level(part)) if scan.views >= 4 else None,
         facts=Facts.of(scan).lines(),
     )
 

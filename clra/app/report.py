@@ -13,6 +13,7 @@ from clra.app.findings import Errors, Findings
 from clra.app.progress import duration
 from clra.app.records import Record
 from clra.io.atomic import atomic_path
+from clra.methods.quality import Quality
 from clra.methods.results import Iteration
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def render(findings: Findings) -> str:
         *([_errors(findings.errors)] if findings.errors else []),
         *_pictures(findings.comparison),
         _trust(record),
+        *([_quality(findings.quality)] if findings.quality else []),
         _settings(findings),
     ]
     subtitle = [f"{record.motion.views} radiographs"]
@@ -274,6 +276,37 @@ def _trust(record: Record) -> str:
             page.bars(record.gauge, "pixel"),
         ]
     return page.section("How far to trust it", *parts)
+
+
+def _quality(quality: Quality) -> str:
+    rows = [
+        [
+            "unexplained part of a radiograph",
+            f"{100 * quality.unexplained_before:.1f} %",
+            f"{100 * quality.unexplained_after:.1f} %",
+        ],
+        ["sharpness of the volume", "1", f"{quality.sharpness:.2f}"],
+        [
+            "disagreement of half scans, u and v [pixel]",
+            "",
+            f"{quality.half_u:.3f}, {quality.half_v:.3f}",
+        ],
+    ]
+    return page.section(
+        "What the radiographs alone tell",
+        page.table(["", "before", "after"], rows),
+        page.paragraph(
+            "Unexplained: RMS of a radiograph less its re-projection, as a part of its own "
+            "contrast in the band that is registered, median over the views. What stays after "
+            "alignment is noise and what the reconstruction cannot do. Sharpness: mean squared "
+            "gradient inside the field of view, relative to before; noise counts as sharp, too. "
+            "Half scans: every view is registered with two volumes, from the even and from the "
+            "odd views; how far they differ is how well the data hold the shifts. In simulations "
+            "it was 0.02 to 0.05 pixel with the true motion and 0.04 to 0.11 when each view was "
+            "0.25 pixel off; what both halves share, as a movement of the sample, it cannot show."
+        ),
+        page.paragraph(f"Measured with radiographs binned by {quality.level}."),
+    )
 
 
 def _settings(findings: Findings) -> str:

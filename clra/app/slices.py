@@ -1,7 +1,5 @@
 """Slices of a scan without and with its motion corrected, by the best method for its trajectory."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,7 +54,7 @@ class Slicer:
             return
         self.method = "Katsevich's method"
         if level > 1:
-            scan = Scan(_Read(self._radiographs), self._geometries[0])
+            scan = Scan(self._radiographs, self._geometries[0])
         ideal = corrected(stream, scan, _at_level(motion, before.shape, level))
         self._corrected = Radiographs(stream, ideal, 1)
 
@@ -141,15 +139,3 @@ def _at_level(motion: Motion, panel: tuple[int, int], level: int) -> Motion:
         shift_v=(motion.shift_v + aside_v) / level,
         magnification=motion.magnification,
     )
-
-
-class _Read:
-    """Radiographs as the projections of a scan."""
-
-    def __init__(self, radiographs: Radiographs) -> None:
-        self.shape = radiographs.shape
-        self._radiographs = radiographs
-
-    def __getitem__(self, views: slice) -> NDArray[Any]:
-        start, stop, _ = views.indices(self.shape[0])
-        return self._radiographs.read(slice(start, stop))

@@ -7,6 +7,7 @@ ones come out in the frame of the measured ones, so that what registration finds
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from clra.methods.fbp import ramp_fbp
 from clra.methods.imgr import imgr
+from clra.methods.limits import warn_of_far_motion, warn_of_lost_features
 from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
 from clra.methods.reference import align_to_reference
@@ -115,6 +117,9 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise ValueError(f"reference, motion: found {found}, expected one of them")
+    # What the mask leaves of the panel is aligned as a panel of its own.
+    whole, scan = scan, scan.cropped()
+    aside = whole.window_aside
     stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
     stream = Stream(
         device,
@@ -122,40 +127,47 @@ def align(
         max_host_memory=max_host_memory,
         report=progress,
     )
-    truth = truth or scan.truth
+    truth = scan.truth if truth is None else truth.about(*aside)
+    motion = None if motion is None else motion.about(*aside)
     if reference is not None:
+        if reference.geometry.shape == whole.geometry.shape:
+            reference = replace(reference, mask=whole.mask).cropped()
         drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
         if method == "reference":
-            return drift
+            return _on_panel(drift, whole)
         motion = drift.motion
     grid = grid or default_grid(scan.geometry)
     solver = replace(solver or Solver(), anchor=gauge == "anchored")
     scale = estimate != "shift" and solver.estimator == "gauss-newton"
     start = motion or Motion.identity(scan.views)
     start = start.caused_by("source" if estimate == "source" else "panel")
-    if method == "imgr":
-        return _by_imgr(
-            stream,
-            scan,
-            grid,
-            levels=schedule,
-            align=True,
-            scale=scale,
-            anchor=solver.anchor,
-            motion=start,
-            truth=truth,
-        )
-    run = _Run(stream, scan, with_margin(grid), schedule, scale, solver, start)
-    run.several = stages != (Stage(stages[0].level, 1, 1),)
-    run.truth = truth
     try:
-        for stage in stages:
-            run.align_level(stage)
-    except KeyboardInterrupt:
-        if not run.history:
-            raise
-        raise AlignmentInterrupted(run.result()) from None
-    return run.result()
+        if method == "imgr":
+            solved = _by_imgr(
+                stream,
+                scan,
+                grid,
+                levels=schedule,
+                align=True,
+                scale=scale,
+                anchor=solver.anchor,
+                motion=start,
+                truth=truth,
+            )
+            return _on_panel(solved, whole)
+        run = _Run(stream, scan, with_margin(grid), schedule, scale, solver, start)
+        run.several = stages != (Stage(stages[0].level, 1, 1),)
+        run.truth = truth
+        run.align(stages)
+    except AlignmentInterrupted as stopped:
+        raise AlignmentInterrupted(_on_panel(stopped.result, whole)) from None
+    return _on_panel(run.result(), whole)
+
+
+def _on_panel(result: AlignmentResult, scan: Scan) -> AlignmentResult:
+    """Return a result for what the mask leaves as one for the whole panel."""
+    aside_u, aside_v = scan.window_aside
+    return replace(result, motion=result.motion.about(-aside_u, -aside_v))
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:
@@ -209,6 +221,16 @@ class _Run:
         # magnifications of several per cent.
         self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
 
+    def align(self, stages: Sequence[Stage]) -> None:
+        """Go through the levels; what an interruption leaves is kept."""
+        try:
+            for stage in stages:
+                self.align_level(stage)
+        except KeyboardInterrupt:
+            if not self.history:
+                raise
+            raise AlignmentInterrupted(self.result()) from None
+
     def align_level(self, stage: Stage) -> None:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level)."""
         name = level_name(stage.level)
@@ -237,10 +259,14 @@ class _Run:
                     **self._errors(),
                 )
             )
+            if len(self.history) == 1:
+                warn_of_far_motion(found.motion, stage.level, name)
             # 6, 13: until converged
             if stage.iterations is None and converged(update_u, update_v, previous):
                 break
             previous = update_size(update_u, update_v)[0]
+        if len({entry.level for entry in self.history}) == 1:
+            warn_of_lost_features(self.scan, found.correlation, stage.level, name)
 
     def _iterate(self, radiographs: Radiographs, *, first: bool, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""

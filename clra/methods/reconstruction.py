@@ -78,7 +78,7 @@ def reconstruct(
         scan is one that Katsevich's method cannot treat; says what pitch, panel or field of view
         would do.
     """
-    planes = HostPlanes(grid or default_grid(scan.geometry))
+    planes = HostPlanes(grid or default_grid(scan.cropped().geometry))
     reconstruct_into(
         planes,
         scan,
@@ -129,6 +129,8 @@ def reconstruct_into(
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
+    motion = None if motion is None else motion.about(*scan.window_aside)
+    scan = scan.cropped()
     grid = grid or default_grid(scan.geometry)
     devices = choose_devices(device)
     limits: dict[str, Any] = {

@@ -37,6 +37,9 @@ _FIRST_BAND, _BAND, _SMALL_BAND = (2.0, 8.0), (1.0, 4.0), (1.0, 8.0)
 
 # An estimate that knows the shift only: magnification, gain and correlation 1, sigmas unknown.
 _SHIFT_ALONE = np.array([0, 0, 1, 1, 0, 1, 0, np.nan, np.nan, np.nan])
+REACH = 16.0
+"""Farthest shift that is searched [pixel of the level]."""
+_STILL = 1e-6  # no shift at all
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,7 @@ def registration_for(
     first: bool,
     magnification: bool,
     spread: float = SPREAD,
+    still: bool = False,
 ) -> Registration:
     """Return the estimator for radiographs of a level.
 
@@ -91,6 +95,8 @@ def registration_for(
         Whether to estimate it.
     spread : float
         Its expected spread, as for `Registration`.
+    still : bool
+        Compare the radiographs where they are: gain, offset and sharpness alone are fitted.
     """
     views, rows, columns = radiographs.shape
     size = min(1.0, float(np.hypot(rows, columns)) / _LONG)
@@ -103,8 +109,10 @@ def registration_for(
         low_pass=low_pass,
         high_pass=high_pass,
         mask=None if scan.mask is None else binned_mask(scan.mask, radiographs.level),
-        magnification=magnification,
+        magnification=magnification and not still,
         spread=spread * size**2,
+        coarse=not still,
+        max_shift=_STILL if still else REACH,
         allocator=stream.memory,
         # It keeps a pair's images in a dozen forms; the filters' share is free by now.
         scratch_limit=3 * stream.scratch_limit,

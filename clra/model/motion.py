@@ -145,6 +145,22 @@ class Motion:
             cause=self.cause,
         )
 
+    def about(self, aside_u: float, aside_v: float) -> Motion:
+        """Return the same motion with magnifications about another point than the panel's centre.
+
+        Parameters
+        ----------
+        aside_u, aside_v : float
+            From the centre so far to that point [pixel].
+        """
+        grown = self.magnification - 1
+        return Motion(
+            shift_u=self.shift_u + grown * aside_u,
+            shift_v=self.shift_v + grown * aside_v,
+            magnification=self.magnification,
+            cause=self.cause,
+        )
+
     def caused_by(self, cause: str) -> Motion:
         """Return the same apparent motion, of the panel or of the source."""
         return Motion(

@@ -140,6 +140,53 @@ class Scan:
             raise ValueError(f"{self.name}: view {view}: found a pixel that is no finite number")
         return pixels
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the smallest rectangle that holds all pixels to use."""
+        if self.mask is None:
+            return slice(0, self.geometry.rows), slice(0, self.geometry.columns)
+        rows, columns = np.flatnonzero(self.mask.any(axis=1)), np.flatnonzero(self.mask.any(axis=0))
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+    @property
+    def window_aside(self) -> tuple[float, float]:
+        """(columns, rows) by which the middle of `window` lies off that of the panel."""
+        rows, columns = self.window
+        total_rows, total_columns = self.geometry.shape
+        return (
+            0.5 * (columns.start + columns.stop - total_columns),
+            0.5 * (rows.start + rows.stop - total_rows),
+        )
+
+    def cropped(self) -> Scan:
+        """Return the scan without the rows and columns in which no pixel may be used.
+
+        A panel's shadowed sides would be taken for the sample's. Magnifications are about the
+        middle of what is left: see :meth:`Motion.about`.
+        """
+        rows, columns = self.window
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        if shape == self.geometry.shape:
+            return self
+        aside_u, aside_v = self.window_aside
+        geometry = ConeBeamGeometry(
+            source=self.geometry.source,
+            detector=self.geometry.detector + aside_u * self.geometry.u + aside_v * self.geometry.v,
+            u=self.geometry.u,
+            v=self.geometry.v,
+            shape=shape,
+        )
+        assert self.mask is not None  # else nothing is cropped
+        mask = self.mask[rows, columns]
+        return Scan(
+            _Window(self.projections, rows, columns),
+            geometry,
+            self.kind,
+            name=self.name,
+            truth=None if self.truth is None else self.truth.about(aside_u, aside_v),
+            mask=None if mask.all() else mask,
+        )
+
     def subset(self, index: slice | ArrayLike) -> Scan:
         """Return the scan of some of the views; nothing is read.
 
@@ -157,6 +204,19 @@ class Scan:
             truth=None if self.truth is None else self.truth.subset(index),
             mask=self.mask,
         )
+
+
+class _Window:
+    """A rectangle of other projections."""
+
+    def __init__(self, projections: Projections, rows: slice, columns: slice) -> None:
+        self._projections = projections
+        self._rows, self._columns = rows, columns
+        size = (rows.stop - rows.start, columns.stop - columns.start)
+        self.shape = (projections.shape[0], *size)
+
+    def __getitem__(self, index: slice) -> NDArray[Any]:
+        return np.asarray(self._projections[index])[:, self._rows, self._columns]
 
 
 class _Selection:

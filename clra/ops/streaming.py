@@ -318,6 +318,11 @@ class Radiographs:
             return self._scan.read(views.start, views.stop)
         return self._kept.read(views.start, views.stop)
 
+    def __getitem__(self, views: slice) -> Floats:
+        """Radiographs as the projections of a scan."""
+        start, stop, _ = views.indices(self.shape[0])
+        return self.read(slice(start, stop))
+
     def _read_all(self) -> Store:
         stream = self._stream
         kept = Store(self.shape, stream.room)

@@ -10,6 +10,7 @@ from clra.app.describe import Facts
 from clra.app.findings import Errors, Findings, summary_of
 from clra.app.records import Record
 from clra.app.report import render, write_report
+from clra.methods.quality import Quality
 from clra.model.motion import Motion
 
 
@@ -36,6 +37,9 @@ class Checker(HTMLParser):
         assert self.open.pop() == tag
 
 
+_QUALITY = Quality(2, 0.514, 0.137, 0.083, 0.041, 1.75)
+
+
 @pytest.fixture(scope="module")
 def comparison() -> Comparison:
     random = np.random.default_rng(1)
@@ -52,7 +56,7 @@ def comparison() -> Comparison:
 @pytest.fixture(scope="module")
 def page(record, scan, comparison) -> str:
     errors = Errors.of(record, scan)
-    return render(Findings(record, errors, comparison, Facts.of(scan).lines()))
+    return render(Findings(record, errors, comparison, Facts.of(scan).lines(), _QUALITY))
 
 
 def test_the_page_is_well_formed_and_needs_nothing_else(page):
@@ -90,6 +94,12 @@ def test_the_page_tells_all_there_is(page, record):
         assert part in page, part
 
 
+def test_the_page_says_what_the_radiographs_alone_tell(page):
+    section = page.partition("What the radiographs alone tell")[2].partition("</section>")[0]
+    for number in ("51.4 %", "13.7 %", "0.083, 0.041", "1.75", "binned by 2"):
+        assert number in section
+
+
 def test_text_from_files_is_escaped(page):
     assert "clra align &lt;scan&gt;.nxs" in page
     assert "<scan>" not in page
@@ -97,7 +107,8 @@ def test_text_from_files_is_escaped(page):
 
 def test_the_same_report_twice_is_the_same_page(page, record, scan, comparison):
     errors = Errors.of(record, scan)
-    assert render(Findings(record, errors, comparison, Facts.of(scan).lines())) == page
+    again = Findings(record, errors, comparison, Facts.of(scan).lines(), _QUALITY)
+    assert render(again) == page
 
 
 def test_a_motion_alone_makes_a_page(tmp_path):
