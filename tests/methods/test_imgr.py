@@ -216,6 +216,21 @@ def test_simulated_radiographs_follow_the_motion(rock, geometry, truth, grid, st
     assert np.sqrt(np.mean(left.read(slice(0, VIEWS)) ** 2)) < 0.03 * apart
 
 
+def test_less_memory_than_the_volume_makes_the_same_volume(scan, grid):
+    some = scan.subset(slice(None, None, 8))
+    size = 4 * int(np.prod(grid.shape))
+    free = clra.reconstruct(some, method="imgr", grid=grid, subsets=3)
+    tight = clra.reconstruct(
+        some,
+        method="imgr",
+        grid=grid,
+        subsets=3,
+        max_device_memory=size // 4,
+        max_host_memory=size // 2,
+    )
+    assert np.linalg.norm(tight - free) < 1e-5 * np.linalg.norm(free)
+
+
 def test_few_views_are_believed_less(geometry, grid):
     assert sampled(geometry, grid) == 1
     few = geometry.subset(slice(None, None, 16))
