@@ -53,7 +53,7 @@ def test_central_ray_of_a_sphere_is_its_diameter():
 
 
 @given(
-    st.tuples(*[st.floats(-6, 6)] * 3),
+    st.tuples(*[st.floats(-4, 4)] * 3),  # in front of every source, tilted as it is
     st.floats(0.01, 2.5),
     st.integers(0, 9),
 )
