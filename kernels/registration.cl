@@ -8,8 +8,8 @@
 // x2 = -g h dm/m: five linear unknowns, no gain to be carried on.
 //
 // A round is registration_sums.cl (sums over the image), then advance (one work-item a view solves
-// and moves on). Coordinates are pixels from the centre of the first; c is the panel's centre. `state`
-// keeps STATE floats a view, see registration.clh.
+// and moves on). Coordinates are pixels from the centre of the first; c is the panel's centre.
+// `state` keeps STATE floats a view, see registration.clh.
 
 #include "lanes.clh"
 #include "registration.clh"
