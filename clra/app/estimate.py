@@ -86,8 +86,7 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
                 volume_bytes=4 * nz * ny * nx,
                 voxel_views=updates,
                 reconstruction_s=reconstruction,
-                # Reconstructed, and corrected by what its re-projections lack.
-                iteration_s=2 * (reconstruction + projection) + pixels * speed.registering,
+                iteration_s=reconstruction + projection + pixels * speed.registering,
                 exact_s=exact_updates(geometry, whole) / level**3 * speed.exact_back
                 + pixels * speed.exact_filtering,
                 **_needs(speed, geometry, whole, level),

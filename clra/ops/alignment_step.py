@@ -30,8 +30,8 @@ class AlignmentStep:
     again.
 
     It is the paper's iteration for somebody who keeps radiographs and volume on the device and
-    writes the loop; :func:`clra.align` cuts both to fit the memory, corrects each volume by what
-    its re-projections lack, goes through resolutions, and deals with outliers and with the gauge.
+    writes the loop; :func:`clra.align` cuts both to fit the memory, goes through resolutions, takes
+    off the bias of small panels, and deals with outliers and with the gauge.
 
     Parameters
     ----------

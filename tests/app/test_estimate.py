@@ -31,7 +31,7 @@ def test_costs_follow_from_shapes():
     assert full.voxel_views == pytest.approx(100 * voxels, rel=0.05)
     pixels = 100 * 64 * 48
     assert full.reconstruction_s == pytest.approx(full.voxel_views * 1e-9 + pixels * 1e-8)
-    assert full.iteration_s == pytest.approx(full.voxel_views * 6e-9 + pixels * 5e-8)
+    assert full.iteration_s == pytest.approx(full.voxel_views * 3e-9 + pixels * 4e-8)
     assert np.isnan(full.exact_s)  # no helix
 
 
