@@ -56,7 +56,7 @@ def row(rows: int, columns: int, views: int, shift: float) -> str:
     excess = (left["source"] - left["true"]) / (left["shift+scale"] - left["true"])
     numbers = " | ".join(f"{value:.4f}" for value in left.values())
     return (
-        f"| {rows} x {columns}, {views} views | {shift:g} | {numbers} | {100 * excess:.0f} % | "
+        f"| {rows} x {columns}, {views} views | {shift:g} | {numbers} | {100 * max(excess, 0.0):.1f} % | "
         f"{' | '.join(errors)} |"
     )
 
