@@ -34,6 +34,7 @@ def test_reconstruction_takes_what_is_predicted(budget):
     assert stream.memory.taken == 0
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of noise nothing can be found
 @pytest.mark.parametrize("budget", [None, 12 * MIB])
 def test_alignment_takes_what_is_predicted(budget, monkeypatch):
     scan = _scan()
