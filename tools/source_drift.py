@@ -54,9 +54,10 @@ def row(rows: int, columns: int, views: int, shift: float) -> str:
         error = gauge.error(found, scan.truth)
         errors.append(f"{error.gauge_free_u:.3f}, {error.gauge_free_v:.3f}")
     excess = (left["source"] - left["true"]) / (left["shift+scale"] - left["true"])
+    percent = 100 * max(excess, 0.0)
     numbers = " | ".join(f"{value:.4f}" for value in left.values())
     return (
-        f"| {rows} x {columns}, {views} views | {shift:g} | {numbers} | {100 * max(excess, 0.0):.1f} % | "
+        f"| {rows} x {columns}, {views} views | {shift:g} | {numbers} | {percent:.1f} % | "
         f"{' | '.join(errors)} |"
     )
 
