@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clra.methods.reprojection import with_margin
+from clra.methods.solver import Solver
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.lines import line_stride
@@ -110,10 +111,11 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
     shared, pixels = budgets.shared, int(np.prod(geometry.shape))
     kept = 4 * geometry.views * pixels if level > 1 else 0
-    # The reconstruction and its correction, see `refine`.
-    slab, volume = _slab(budgets, grid, 2), 4 * int(np.prod(grid.shape))
+    # On small panels there is a correction of the reconstruction beside it, see `refine`.
+    volumes = 2 if Solver().is_biased(geometry.shape) else 1
+    slab, volume = _slab(budgets, grid, volumes), 4 * int(np.prod(grid.shape))
     cut = slab < volume
-    arrays = [kept] + [volume] * 2 * cut
+    arrays = [kept] + [volume] * volumes * cut
     in_memory = disk = 0
     for size in arrays:
         if in_memory + size <= budgets.kept:
@@ -124,16 +126,17 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     lined = geometry.rows * line_stride(geometry.columns)
     pairs = max(1, _limited(_REGISTRATION[shared], budgets, 3) // (PAIR_BYTES * lined))
     pairs = min(pairs, chunk // (4 * pixels))
+    on_host = shared and cut and volumes * volume <= budgets.kept - kept
     registering = (
         _projecting(budgets, geometry, chunk)
         + lined * (PAIR_BYTES * pairs + _WINDOW)
         + (1 if shared else 2) * chunk
-        + (0 if shared and cut and 2 * volume <= budgets.kept - kept else slab)
+        + (0 if on_host else slab)
     )
     reading = _chunk(budgets, full)
-    first = reconstruction_need(budgets, geometry, grid, volumes=2)
-    lacking = _projecting(budgets, geometry, chunk) + chunk
-    lacking += 0 if shared and cut and 2 * volume <= budgets.kept - kept else slab
+    first = reconstruction_need(budgets, geometry, grid, volumes=volumes)
+    lacking = _projecting(budgets, geometry, chunk) + chunk + (0 if on_host else slab)
+    lacking *= volumes - 1
     steps = (
         Need(first.device + lacking, first.host + shared * lacking),
         Need(registering, int(shared * registering + _READING * chunk)),

@@ -35,9 +35,16 @@ def test_reconstruction_takes_what_is_predicted(budget):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of noise nothing can be found
-@pytest.mark.parametrize("budget", [None, 12 * MIB])
-def test_alignment_takes_what_is_predicted(budget, monkeypatch):
-    scan = _scan()
+@pytest.mark.parametrize(
+    ("panel", "level", "budget"),
+    [
+        ((120, 96), 2, None),
+        ((120, 96), 2, 12 * MIB),
+        ((300, 280), 1, 64 * MIB),  # large enough for registration without a correction
+    ],
+)
+def test_alignment_takes_what_is_predicted(panel, level, budget, monkeypatch):
+    scan = _scan(150 if level == 2 else 40, panel)
     streams = []
 
     def remembered(*arguments, **options):
@@ -45,7 +52,8 @@ def test_alignment_takes_what_is_predicted(budget, monkeypatch):
         return streams[-1]
 
     monkeypatch.setattr(alignment, "Stream", remembered)
-    clra.align(scan, schedule="1HR", max_device_memory=budget)
-    need = alignment_need(streams[0].budgets, scan.geometry, default_grid(scan.geometry), 2)
+    schedule = {1: "1FR", 2: "1HR"}[level]
+    clra.align(scan, schedule=schedule, max_device_memory=budget)
+    need = alignment_need(streams[0].budgets, scan.geometry, default_grid(scan.geometry), level)
     assert streams[0].memory.peak == pytest.approx(need.device, rel=AGREES)
     assert need.device <= streams[0].budgets.device
