@@ -1,4 +1,4 @@
-"""The paper's simulation, its Figures 1 to 3, what is past it, and what each part is worth.
+"""The paper's simulation, its Figures 1 and 3, what is past it, and what each part is worth.
 
 ``python tools/reproduce_figure3.py --scale 1 -o FOLDER`` is the paper's size (3456 radiographs, we
 take 928 x 512); ``--scale 4`` a quarter of it in every respect. Four scans, {helix, space-filling}
@@ -207,7 +207,7 @@ def claims(runs: dict[str, Any], scale: int) -> list[str]:
 
 
 def draw(runs: dict[str, Any], scale: int, path: Path) -> None:
-    """Draw the paper's Figures 1 to 3."""
+    """Draw the paper's Figures 1 and 3."""
     import matplotlib
 
     matplotlib.use("Agg")
