@@ -1,4 +1,3 @@
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -7,13 +6,10 @@ import pytest
 from clra.app.estimate import costs_of, costs_table, size
 from clra.app.simulate import paper_like
 from clra.app.speed import Speed, measure
-from clra.methods.katsevich import katsevich
 from clra.model.grid import default_grid
-from clra.model.scan import Scan
 from clra.model.trajectory import double_helix
 from clra.ops import opencl
 from clra.ops.memory import Budgets
-from clra.ops.streaming import Radiographs, Stream
 
 SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
 
@@ -103,17 +99,3 @@ def test_the_papers_double_helix():
         for cost in (full, costs_of(small, speed)[0])
     ]
     assert back[0] / back[1] == pytest.approx(16**4, rel=0.1)
-
-
-def test_time_of_katsevich_is_what_it_takes():
-    geometry = _wood(24)
-    speed = measure(geometry)
-    scan = Scan(np.ones((geometry.views, *geometry.shape), np.float32), geometry)
-    # A sample as wide as that is refused, so its radiographs are dark at the sides.
-    scan.projections[:, :, :12] = scan.projections[:, :, -12:] = 0
-    stream, grid = Stream(), default_grid(geometry)
-    katsevich(stream, Radiographs(stream, scan, 1), geometry, grid)  # builds the kernels
-    started = time.perf_counter()
-    katsevich(stream, Radiographs(stream, scan, 1), geometry, grid)
-    seconds = time.perf_counter() - started
-    assert 0.3 < costs_of(geometry, speed)[0].exact_s / seconds < 3
