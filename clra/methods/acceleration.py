@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.model.motion import Motion
+
 Floats = NDArray[np.float64]
 
 # Tikhonov weight relative to the squared length of each difference: at a tenth of it random motions
@@ -73,3 +75,53 @@ class Anderson:
         if np.abs(step).max() > _LONGEST * max(float(np.abs(f).max()), self.floor):
             return x + f
         return np.asarray(x + step)
+
+
+class MotionSteps:
+    """Extrapolation of motions, all numbers written as lengths so that none rules it.
+
+    Parameters
+    ----------
+    anderson : Anderson
+        Which knows no steps yet.
+    shape : (int, int)
+        Rows and columns of the full-resolution panel.
+    scale : bool
+        Whether magnifications are estimated.
+    """
+
+    def __init__(self, anderson: Anderson, shape: tuple[int, int], scale: bool) -> None:
+        self._anderson = anderson
+        self._scale = scale
+        # Pixels by which a point of middling distance from the centre moves a unit of scale.
+        self._lever = 0.25 * float(np.hypot(*shape))
+
+    def next(self, here: Motion, there: Motion, *, plain: bool) -> tuple[Motion, Floats]:
+        """Return the next motion, and the plain step in u and v, (2, views) [pixel].
+
+        Parameters
+        ----------
+        here, there : Motion
+            As it was, and as the iteration finds it.
+        plain : bool
+            Go there, and learn nothing from it.
+        """
+        start, end = self._as_lengths(here), self._as_lengths(there)
+        moved = end if plain else self._anderson.next(start, end - start)
+        motion = Motion(
+            shift_u=moved[0],
+            shift_v=moved[1],
+            magnification=np.exp(moved[2] / self._lever) if self._scale else None,
+            cause=here.cause,
+        )
+        return motion.normalised(), (end - start)[:2]
+
+    def restart(self) -> None:
+        """Forget the steps so far: those of another level."""
+        self._anderson.restart()
+
+    def _as_lengths(self, motion: Motion) -> Floats:
+        rows = [motion.shift_u, motion.shift_v]
+        if self._scale:
+            rows.append(self._lever * np.log(motion.magnification))
+        return np.stack(rows)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods.acceleration import MotionSteps
 from clra.methods.fbp import ramp_fbp
 from clra.methods.imgr import imgr
 from clra.methods.limits import warn_of_far_motion, warn_of_lost_features
@@ -214,7 +215,8 @@ class _Run:
 
     def __post_init__(self) -> None:
         self.motion = self.start
-        self.anderson = self.solver.acceleration()
+        shape = self.scan.geometry.shape
+        self.steps = MotionSteps(self.solver.acceleration(), shape, self.scale)
         points = sample_points(self.grid)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
@@ -238,24 +240,22 @@ class _Run:
         radiographs = Radiographs(self.stream, self.scan, stage.level)
         if not self.history:
             self.weak = odd_radiographs(self.stream, radiographs)
-        self.anderson.restart()
+        self.steps.restart()
         self.bias = None
         previous = None
         for iteration in range(1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(radiographs, first=not self.history, title=of)
-            update_u, update_v = np.abs(self._move(found))
+            update_u, update_v = update = np.abs(self._move(found))
             self.history.append(
-                Iteration(
-                    level=name,
-                    iteration=iteration,
-                    update_u_median=float(np.median(update_u)),
-                    update_v_median=float(np.median(update_v)),
-                    update_max=float(max(update_u.max(), update_v.max())),
-                    correlation=float(np.median(found.correlation)),
-                    residual=float(np.median(found.residual)),
-                    seconds=time.perf_counter() - started,
+                Iteration.of(
+                    name,
+                    iteration,
+                    update,
+                    found.correlation,
+                    found.residual,
+                    time.perf_counter() - started,
                     **self._errors(),
                 )
             )
@@ -320,37 +320,17 @@ class _Run:
         self.weak = outliers(found.correlation)
         self.found = from_neighbours(self.motion.then(found.motion), self.weak).normalised()
         anchored = self.shift_gauge.anchored(self.found, self.start)
-        here = self._as_lengths(self.motion)
-        there = self._as_lengths(anchored if self.solver.anchor else self.found)
+        there = anchored if self.solver.anchor else self.found
         # The first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
-        moved = self.anderson.next(here, there - here) if self.history else there
-        half = self._lever
-        self.motion = Motion(
-            shift_u=moved[0],
-            shift_v=moved[1],
-            magnification=np.exp(moved[2] / half) if self.scale else None,
-            cause=self.motion.cause,
-        ).normalised()
-        return np.asarray((there - here)[:2])
+        self.motion, step = self.steps.next(self.motion, there, plain=not self.history)
+        return step
 
     @property
     def _shifts_first(self) -> bool:
         """Whether the magnification waits: others follow, and none is known already."""
         known = bool((self.start.magnification != 1).any())
         return self.solver.shifts_first and self.several and not known
-
-    @property
-    def _lever(self) -> float:
-        """Pixels by which a point of middling distance from the centre moves a unit of scale."""
-        return 0.25 * float(np.hypot(*self.scan.geometry.shape))
-
-    def _as_lengths(self, motion: Motion) -> Floats:
-        """Write the motion as rows of one unit, so that none rules the extrapolation."""
-        rows = [motion.shift_u, motion.shift_v]
-        if self.scale:
-            rows.append(self._lever * np.log(motion.magnification))
-        return np.stack(rows)
 
     def _errors(self) -> dict[str, float]:
         if self.truth is None:

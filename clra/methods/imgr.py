@@ -40,6 +40,7 @@ from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import converged, level_name, parse_levels
+from clra.model.visibility import sampled
 from clra.ops.memory import Store
 from clra.ops.multigrid import add_update, cropped, prolongate, restrict
 from clra.ops.registration import ESTIMATE_FIELDS
@@ -281,20 +282,15 @@ class _Run:
 
     def _history(self, step: Step, motion: Motion, found: Registered) -> tuple[Iteration, ...]:
         before = self.done.motion
-        update_u, update_v = (
-            np.abs(motion.shift_u - before.shift_u),
-            np.abs(motion.shift_v - before.shift_v),
-        )
+        update = [motion.shift_u - before.shift_u, motion.shift_v - before.shift_v]
         errors = {} if self.truth is None else self.gauge.error(motion, self.truth).means()
-        iteration = Iteration(
-            level=step.level,
-            iteration=step.cycle,
-            update_u_median=float(np.median(update_u)),
-            update_v_median=float(np.median(update_v)),
-            update_max=float(max(update_u.max(), update_v.max())),
-            correlation=float(np.median(found.correlation)),
-            residual=float(np.median(found.residual)),
-            seconds=step.seconds,
+        iteration = Iteration.of(
+            step.level,
+            step.cycle,
+            np.stack(update),
+            found.correlation,
+            found.residual,
+            step.seconds,
             misfit=step.misfit,
             **errors,
         )
@@ -351,30 +347,3 @@ class _Run:
         return binned_mask(
             np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask, level
         )
-
-
-def sampled(geometry: ConeBeamGeometry, grid: VolumeGrid) -> float:
-    """Tell which part of a back-projected update to believe, for want of views.
-
-    Detail up to half the finest that a grid of n voxels across can hold takes pi n / 4 views. Of q
-    times fewer the update holds, beside the detail, streaks of about q - 1 times its energy; scaled
-    by 1 / q it comes nearest to the detail. For rocks of 87 voxels and 86, 22 views the best
-    factors at full resolution are 1.03, 0.43, at half 1.11, 0.65; these are 1, 0.32 and 1, 0.64.
-
-    Parameters
-    ----------
-    geometry : ConeBeamGeometry
-        Of the views.
-    grid : VolumeGrid
-        Of the update.
-
-    Returns
-    -------
-    float
-        At most 1.
-    """
-    heights = grid.coordinates()[2]
-    axis = np.column_stack([np.zeros((len(heights), 2)), heights])
-    row = geometry.project(axis)[..., 1]
-    seen = ((row >= 0) & (row <= geometry.rows - 1)).sum(axis=0).max()
-    return min(1.0, float(seen) / (0.25 * np.pi * grid.shape[2]))

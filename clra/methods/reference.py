@@ -78,19 +78,16 @@ def align_to_reference(
     def everywhere(values: Floats) -> Floats:
         return np.interp(np.arange(scan.views), drift.views, values)
 
-    step = np.abs(np.stack([motion.shift_u, motion.shift_v]))
     return AlignmentResult(
         motion=motion,
         history=[
-            Iteration(
-                level="FR",
-                iteration=1,
-                update_u_median=float(np.median(step[0])),
-                update_v_median=float(np.median(step[1])),
-                update_max=float(step.max()),
-                correlation=float(np.median(found.correlation)),
-                residual=float(np.median(found.residual)),
-                seconds=time.perf_counter() - started,
+            Iteration.of(
+                "FR",
+                1,
+                np.stack([motion.shift_u, motion.shift_v]),
+                found.correlation,
+                found.residual,
+                time.perf_counter() - started,
                 **({} if truth is None else gauge.error(motion, truth).means()),
             )
         ],

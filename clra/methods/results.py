@@ -49,6 +49,31 @@ class Iteration:
     gauge_free_m: float | None = None
     misfit: float | None = None
 
+    @classmethod
+    def of(
+        cls,
+        level: str,
+        iteration: int,
+        update: Floats,
+        correlation: Floats,
+        residual: Floats,
+        seconds: float,
+        **more: float,
+    ) -> "Iteration":
+        """Sum an iteration up; of `update`, (2, views), the size counts."""
+        size = np.abs(update)
+        return cls(
+            level=level,
+            iteration=iteration,
+            update_u_median=float(np.median(size[0])),
+            update_v_median=float(np.median(size[1])),
+            update_max=float(size.max()),
+            correlation=float(np.median(correlation)),
+            residual=float(np.median(residual)),
+            seconds=seconds,
+            **more,
+        )
+
 
 @dataclass(frozen=True)
 class AlignmentResult:

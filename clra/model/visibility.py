@@ -39,3 +39,30 @@ def runs(chosen: NDArray[np.bool_]) -> Iterator[slice]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
     for start, stop in edges.reshape(-1, 2):
         yield slice(int(start), int(stop))
+
+
+def sampled(geometry: ConeBeamGeometry, grid: VolumeGrid) -> float:
+    """Tell which part of a back-projected update to believe, for want of views.
+
+    Detail up to half the finest that a grid of n voxels across can hold takes pi n / 4 views. Of q
+    times fewer the update holds, beside the detail, streaks of about q - 1 times its energy; scaled
+    by 1 / q it comes nearest to the detail. For rocks of 87 voxels and 86, 22 views the best
+    factors at full resolution are 1.03, 0.43, at half 1.11, 0.65; these are 1, 0.32 and 1, 0.64.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the views.
+    grid : VolumeGrid
+        Of the update.
+
+    Returns
+    -------
+    float
+        At most 1.
+    """
+    heights = grid.coordinates()[2]
+    axis = np.column_stack([np.zeros((len(heights), 2)), heights])
+    row = geometry.project(axis)[..., 1]
+    seen = ((row >= 0) & (row <= geometry.rows - 1)).sum(axis=0).max()
+    return min(1.0, float(seen) / (0.25 * np.pi * grid.shape[2]))

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import clra
-from clra.methods.imgr import imgr, sampled
+from clra.methods.imgr import imgr
 from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.osem_tr import OrderedSubsets
 from clra.methods.residuals import between, residuals
@@ -13,6 +13,7 @@ from clra.model.gauge import sample_points, without_gauge
 from clra.model.grid import default_grid
 from clra.model.perturbation import random_motion, smooth_motion
 from clra.model.phantom import porous
+from clra.model.visibility import sampled
 from clra.ops.memory import Store
 from clra.ops.slabs import SlabProjector, volume_from
 from clra.ops.streaming import Radiographs, Stream
