@@ -117,21 +117,21 @@ def measured(method: str, scan: Path, folder: Path, host: int | None, device: in
 
 
 def predicted(method: str, path: Path, host: int, device: int) -> Any:
-    """Ask what clra info would say; of multigrid iteration it says nothing."""
+    """Ask what clra info would say."""
     import clra
-    from clra.methods.needs import alignment_need, reconstruction_need
+    from clra.methods.needs import alignment_need, multigrid_need, reconstruction_need
     from clra.model.grid import default_grid
     from clra.ops import opencl
     from clra.ops.memory import Budgets
 
-    if method == "imgr":
-        return None
     geometry = clra.read_scan(path).geometry
     grid = default_grid(geometry)
     budgets = Budgets.of(opencl.choose_device(), device, host)
     if method == "align":
         quarter, half = (alignment_need(budgets, geometry, grid, level) for level in (4, 2))
         return quarter.beside(half)
+    if method == "imgr":
+        return multigrid_need(budgets, geometry, grid)
     return reconstruction_need(budgets, geometry, grid, 2 if method == "katsevich" else 1)
 
 
@@ -174,9 +174,8 @@ def main() -> None:
             free = measured(method, scan, folder, None, None)
             tight = measured(method, scan, folder, host, device)
             need = predicted(method, scan, host, device)
-            told = (need.host, need.device) if need else (None, None)
-            values = [host, tight["host"], told[0], device, tight["device"], told[1]]
-            sizes = " | ".join("" if v is None else f"{v / 2**20:.1f}" for v in values)
+            values = [host, tight["host"], need.host, device, tight["device"], need.device]
+            sizes = " | ".join(f"{value / 2**20:.1f}" for value in values)
             print(
                 f"| {method} | {sizes} | {difference(method, free['file'], tight['file'])} |",
                 flush=True,

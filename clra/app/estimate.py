@@ -37,8 +37,8 @@ class Cost:
         Time of a reconstruction, and of an iteration of alignment, without reading the scan.
     exact_s : float
         Time of Katsevich's method; not a number where it cannot treat the scan.
-    reconstruction, iteration, exact : Need or None
-        Memory that they take at their peaks, where there is a device.
+    reconstruction, iteration, exact, multigrid : Need or None
+        Memory that they, and at full resolution IMGR, take at their peaks, where there is a device.
     """
 
     level: str
@@ -53,6 +53,7 @@ class Cost:
     reconstruction: "Need | None" = None
     iteration: "Need | None" = None
     exact: "Need | None" = None
+    multigrid: "Need | None" = None
 
 
 def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
@@ -100,7 +101,7 @@ def _needs(
 ) -> dict[str, "Need"]:
     if speed.budgets is None:
         return {}
-    from clra.methods.needs import alignment_need, reconstruction_need
+    from clra.methods.needs import alignment_need, multigrid_need, reconstruction_need
 
     binned = (geometry.binned(level), grid.binned(level)) if level > 1 else (geometry, grid)
     needs = {
@@ -109,6 +110,8 @@ def _needs(
     }
     if not math.isnan(speed.exact_back):
         needs["exact"] = reconstruction_need(speed.budgets, *binned, lines=2)
+    if level == 1 and min(geometry.shape) >= max(LEVELS):
+        needs["multigrid"] = multigrid_need(speed.budgets, geometry, grid)
     return needs
 
 
@@ -167,6 +170,7 @@ def _memory_rows(costs: Sequence[Cost]) -> list[tuple[str, ...]]:
             ("reconstruction", cost.reconstruction),
             ("iteration", cost.iteration),
             ("katsevich", cost.exact),
+            ("imgr", cost.multigrid),
         ):
             if need is not None:
                 sizes = (size(need.device), size(need.host), size(need.disk))

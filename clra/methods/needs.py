@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clra.methods.reprojection import with_margin
+from clra.methods.reprojection import band_of, with_margin
 from clra.methods.solver import Solver
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.lines import line_stride
 from clra.ops.memory import Budgets
-from clra.ops.registration import PAIR_BYTES
+from clra.ops.registration import pair_bytes
 
 # Bytes that operators use between their kernels where a budget leaves them, on CPUs and elsewhere.
 _PROJECTOR = {True: 24 << 20, False: 256 << 20}
@@ -109,27 +109,56 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     """
     geometry = full.binned(level) if level > 1 else full
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
-    shared, pixels = budgets.shared, int(np.prod(geometry.shape))
-    kept = 4 * geometry.views * pixels if level > 1 else 0
+    kept = _bytes(geometry) if level > 1 else 0
     # On small panels there is a correction of the reconstruction beside it, see `refine`.
     volumes = 2 if Solver().is_biased(geometry.shape) else 1
+    return _registering_need(budgets, full, geometry, grid, volumes, [kept])
+
+
+def multigrid_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid) -> Need:
+    """Return what IMGR takes at its last level, full resolution, where it takes most.
+
+    Parameters
+    ----------
+    budgets, full, grid
+        As :func:`alignment_need` takes them.
+    """
+    # Radiographs of the lower levels, and the simulated ones.
+    kept = [_bytes(full.binned(level)) for level in (4, 2)] + [_bytes(full)]
+    return _registering_need(budgets, full, full, with_margin(grid), 2, kept)
+
+
+def _registering_need(
+    budgets: Budgets,
+    full: ConeBeamGeometry,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    volumes: int,
+    kept: list[int],
+) -> Need:
+    """Return what it takes to reconstruct volumes, to project and to register.
+
+    `kept` are the sizes of the arrays that stay on the host beside the volumes.
+    """
+    shared, pixels = budgets.shared, int(np.prod(geometry.shape))
     slab, volume = _slab(budgets, grid, volumes), 4 * int(np.prod(grid.shape))
     cut = slab < volume
-    arrays = [kept] + [volume] * volumes * cut
     in_memory = disk = 0
-    for size in arrays:
+    for size in kept + [volume] * volumes * cut:
         if in_memory + size <= budgets.kept:
             in_memory += size
         else:
             disk += size
+    on_host = shared and cut and sum(kept) + volumes * volume <= budgets.kept
     chunk = _chunk(budgets, geometry)
     lined = geometry.rows * line_stride(geometry.columns)
-    pairs = max(1, _limited(_REGISTRATION[shared], budgets, 3) // (PAIR_BYTES * lined))
+    pair = pair_bytes(geometry.shape, band_of(geometry.shape)[1])
+    pairs = max(1, _limited(_REGISTRATION[shared], budgets, 3) // pair)
     pairs = min(pairs, chunk // (4 * pixels))
-    on_host = shared and cut and volumes * volume <= budgets.kept - kept
     registering = (
         _projecting(budgets, geometry, chunk)
-        + lined * (PAIR_BYTES * pairs + _WINDOW)
+        + pair * pairs
+        + _WINDOW * lined
         + (1 if shared else 2) * chunk
         + (0 if on_host else slab)
     )
@@ -144,6 +173,11 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     )
     most = steps[0].beside(steps[1]).beside(steps[2])
     return Need(most.device, most.host + in_memory + _SMALL, disk)
+
+
+def _bytes(geometry: ConeBeamGeometry) -> int:
+    """All radiographs."""
+    return 4 * geometry.views * int(np.prod(geometry.shape))
 
 
 def _limited(wanted: int, budgets: Budgets, shares: int = 1) -> int:

@@ -99,8 +99,7 @@ def registration_for(
         Compare the radiographs where they are: gain, offset and sharpness alone are fitted.
     """
     views, rows, columns = radiographs.shape
-    size = min(1.0, float(np.hypot(rows, columns)) / _LONG)
-    low_pass, high_pass = _FIRST_BAND if first else _BAND if size == 1 else _SMALL_BAND
+    low_pass, high_pass = band_of((rows, columns), first=first)
     chunks = stream.chunks(views, radiographs.view_bytes)
     return Registration(
         stream.context,
@@ -110,13 +109,23 @@ def registration_for(
         high_pass=high_pass,
         mask=None if scan.mask is None else binned_mask(scan.mask, radiographs.level),
         magnification=magnification and not still,
-        spread=spread * size**2,
+        spread=spread * _size((rows, columns)) ** 2,
         coarse=not still,
         max_shift=_STILL if still else REACH,
         allocator=stream.memory,
         # It keeps a pair's images in a dozen forms; the filters' share is free by now.
         scratch_limit=3 * stream.scratch_limit,
     )
+
+
+def band_of(shape: tuple[int, int], *, first: bool = False) -> tuple[float, float]:
+    """Sigmas of the band-pass for images of (rows, columns), low and high [pixel]."""
+    return _FIRST_BAND if first else _BAND if _size(shape) == 1 else _SMALL_BAND
+
+
+def _size(shape: tuple[int, int]) -> float:
+    """Diagonal as a part of what is long enough, at most 1."""
+    return min(1.0, float(np.hypot(*shape)) / _LONG)
 
 
 def binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:

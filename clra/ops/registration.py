@@ -48,8 +48,13 @@ _MAX_STEP = 2.0
 _MAX_MAGNIFICATION = 0.05
 # Scratch memory. On two cores, half of it is 3 % slower and twice as much 2 % faster.
 _SCRATCH_CPU, _SCRATCH_GPU = 128 << 20, 512 << 20
-# Of it for an element of a pair's lines, from 64 x 64 to 928 x 512 pixels.
-PAIR_BYTES = 32
+
+
+def pair_bytes(shape: tuple[int, int], high_pass: float) -> int:
+    """Bytes of scratch memory that a pair of (rows, columns) takes in :class:`Registration`."""
+    # Most of it are images in lines; the wide Gaussian works on images that many times coarser.
+    coarser = max(1.0, min(high_pass, min(shape) / 4) / 4)
+    return round((32 + 18 / coarser**2) * shape[0] * line_stride(shape[1]))
 
 
 class Registration:
@@ -155,7 +160,7 @@ class Registration:
         if views is not None and views < 1:
             raise ValueError(f"views: found {views}, expected 1 or more")
         most = within(_SCRATCH_CPU if cpu else _SCRATCH_GPU, scratch_limit)
-        fitting = max(1, most // (PAIR_BYTES * rows * line_stride(columns)))
+        fitting = max(1, most // pair_bytes(shape, high_pass))
         views = fitting if views is None else min(views, fitting)
         self._context, self._views = context, views
         self._iterations, self._magnification = iterations, int(magnification)

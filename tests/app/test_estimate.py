@@ -55,6 +55,7 @@ def test_sizes_and_table():
     text = costs_table(costs_of(geometry, speed), speed)
     assert "FR" in text and "48 x 48" not in text.splitlines()[0] and "a device" in text
     assert "4 GiB on the host" in text
+    assert text.count("imgr") == 1
 
 
 def test_a_device_is_measured_in_a_moment():

@@ -7,7 +7,8 @@ import clra
 from clra.app.simulate import paper_like
 from clra.methods import alignment
 from clra.methods.fbp import ramp_fbp
-from clra.methods.needs import alignment_need, reconstruction_need
+from clra.methods.imgr import imgr
+from clra.methods.needs import alignment_need, multigrid_need, reconstruction_need
 from clra.model.grid import default_grid
 from clra.ops.streaming import HostPlanes, Radiographs, Stream
 
@@ -57,3 +58,13 @@ def test_alignment_takes_what_is_predicted(panel, level, budget, monkeypatch):
     need = alignment_need(streams[0].budgets, scan.geometry, default_grid(scan.geometry), level)
     assert streams[0].memory.peak == pytest.approx(need.device, rel=AGREES)
     assert need.device <= streams[0].budgets.device
+
+
+@pytest.mark.parametrize("budget", [None, 12 * MIB])
+def test_multigrid_takes_what_is_predicted(budget):
+    scan = _scan()
+    stream = Stream(max_device_memory=budget)
+    grid = default_grid(scan.geometry)
+    imgr(stream, scan, grid, align=True, cycles=1)
+    need = multigrid_need(stream.budgets, scan.geometry, grid)
+    assert stream.memory.peak == pytest.approx(need.device, rel=AGREES)
