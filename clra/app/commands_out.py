@@ -9,9 +9,6 @@ from clra.app.commands_reconstruct import reconstruct
 from clra.app.console import Console, Memory, Reading, command
 
 ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
-MotionPath = Annotated[
-    Path | None, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
-]
 
 
 def align(

@@ -30,10 +30,10 @@ INITIAL = ("fbp", "uniform")
 VOLUMES = 4
 # A voxel whose denominator is below this part of the largest is hardly met by rays.
 _LEAST = 1e-4
-# What voxels start from in the multiplicative form, where they would be 0: a part of the mean.
 # Steps are this much longer than the paraboloids ask for. Anything below 2 still raises the
 # likelihood; 1.5 saves a pass in three, 1.9 gathers more noise.
 _RELAXATION = 1.5
+# What voxels start from in the multiplicative form, where they would be 0: a part of the mean.
 _FLOOR = 0.02
 
 
