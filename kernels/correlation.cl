@@ -74,14 +74,12 @@ kernel void windowed(
     out[((ulong)view * out_rows + j) * out_columns + i] = value;
 }
 
-// measured := measured * conj(simulated), and divided by its modulus if whitened (0 stays 0). Global
-// size (count), rounded up at will.
+// measured := measured * conj(simulated). Global size (count), rounded up at will.
 kernel void cross_power(
     global float2 *restrict measured, // spectra, (count,)
     const ulong measured_offset,
     global const float2 *restrict simulated, // spectra, (count,)
     const ulong simulated_offset,
-    const int whiten, // 0 or 1
     const int count)
 {
     measured += measured_offset;
@@ -90,12 +88,34 @@ kernel void cross_power(
     if (k >= count)
         return;
     const float2 a = measured[k], b = simulated[k];
-    float2 power = (float2)(a.x * b.x + a.y * b.y, a.y * b.x - a.x * b.y);
-    if (whiten) {
-        const float modulus = sqrt(power.x * power.x + power.y * power.y);
-        power = modulus > 0.0f ? power / modulus : (float2)(0.0f, 0.0f);
+    measured[k] = (float2)(a.x * b.x + a.y * b.y, a.y * b.x - a.x * b.y);
+}
+
+// Whiten each spectrum: frequencies count alike, but for those whose modulus is below `least` times
+// the mean modulus, which fade out. Work-group (GROUP, 1), global size (GROUP, views).
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void whiten(
+    global float2 *restrict spectrum, // (views, count)
+    const ulong spectrum_offset,
+    const float least,
+    const int count)
+{
+    spectrum += spectrum_offset;
+    const int item = get_local_id(0), view = get_global_id(1);
+    spectrum += (ulong)view * count;
+    float sum = 0.0f;
+    for (int k = item; k < count; k += GROUP)
+        sum += length(spectrum[k]);
+    local float sums[GROUP];
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    sum = 0.0f;
+    for (int k = 0; k < GROUP; ++k)
+        sum += sums[k];
+    const float floor = least * sum / count;
+    for (int k = item; k < count; k += GROUP) {
+        const float modulus = length(spectrum[k]) + floor;
+        spectrum[k] = modulus > 0.0f ? spectrum[k] / modulus : (float2)(0.0f, 0.0f);
     }
-    measured[k] = power;
 }
 
 // Peak of each map among shifts of at most (reach_u, reach_v), refined by the parabola that fits

@@ -15,6 +15,13 @@ from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 from clra.ops.windows import tukey
 
+# Part of the mean modulus of a pair's cross-power below which a frequency fades out of the phase
+# correlation. Where motion has blurred a reconstruction, what a re-projection still has of high
+# frequencies is the radiograph's own share of it, which lies where it lay: with all frequencies
+# alike most pairs of the paper's simulation are found not to have moved. An error of 5.2 pixels
+# becomes 4.3 in the first iteration with 0, 0.68 with 1e-3, 0.29 with 1e-2, 0.33 with 0.1.
+_FAINT = 0.01
+
 
 class CorrelationPeak:
     """Peak of the cyclic cross-correlation of the images in its two arrays.
@@ -32,7 +39,7 @@ class CorrelationPeak:
     pixel : float
         Unit of these images' pixels, in which shifts are returned.
     whiten : bool
-        Phase correlation: all spatial frequencies count alike.
+        Phase correlation: all spatial frequencies count alike, but for the faintest, see `_FAINT`.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
 
@@ -60,7 +67,7 @@ class CorrelationPeak:
             fast_length(context, shape[1]),
         )
         self._reach = min(reach[0], (shape[0] - 1) // 2), min(reach[1], (shape[1] - 1) // 2)
-        self._pixel, self._whiten = float(pixel), int(whiten)
+        self._pixel = float(pixel)
         memory = Scratch(context, allocator)
         self._fft = RealFFT(context, (views, rows, columns), allocator=memory)
         self.measured = memory.empty((views, rows, columns))
@@ -68,9 +75,9 @@ class CorrelationPeak:
         self._spectra = [memory.empty(self._fft.spectrum_shape, np.complex64) for _ in range(2)]
         self._cross_power = Step(context, "correlation.cl", "cross_power", (64,))
         self._group = group(context, "correlation.cl", "peak", 64)
-        self._peak = Step(
-            context, "correlation.cl", "peak", (self._group, 1), {"GROUP": self._group}
-        )
+        shared = (self._group, 1), {"GROUP": self._group}
+        self._whiten = Step(context, "correlation.cl", "whiten", *shared) if whiten else None
+        self._peak = Step(context, "correlation.cl", "peak", *shared)
 
     def __call__(
         self,
@@ -102,9 +109,12 @@ class CorrelationPeak:
         event = self._cross_power(
             queue,
             (measured.size,),
-            *(measured, simulated, self._whiten, measured.size),
+            *(measured, simulated, measured.size),
             wait_for=events,
         )
+        if self._whiten:
+            size = (self._group, n), measured, _FAINT, measured.size // n
+            event = self._whiten(queue, *size, wait_for=[event])
         event = self._fft.inverse(queue, self.measured[:n], measured, [event])
         return self._peak(
             queue,
@@ -200,10 +210,10 @@ class CoarseShift:
 class PhaseCorrelation:
     """Phase correlation with a parabola through the peak: the classical estimator.
 
-    The mean is removed, a Tukey window of 0.35 applied, the spectra's cross-power whitened; the
-    integer peak is refined by the least-squares parabola of its 3 x 3 neighbourhood. It is the
-    baseline beside :class:`clra.ops.registration.Registration`, which is several times more
-    accurate and fails less on blurred images.
+    The mean is removed, a Tukey window of 0.35 applied, the spectra's cross-power whitened (but for
+    its faintest frequencies); the integer peak is refined by the least-squares parabola of its
+    3 x 3 neighbourhood. It is the baseline beside :class:`clra.ops.registration.Registration`,
+    which is several times more accurate and fails less on blurred images.
 
     Parameters
     ----------
