@@ -22,8 +22,8 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.model.trajectory import helix as helix
     from clra.model.trajectory import space_filling as space_filling
     from clra.ops.alignment_step import AlignmentStep as AlignmentStep
+    from clra.ops.devices import devices as devices
     from clra.ops.linear import as_linear_operator as as_linear_operator
-    from clra.ops.opencl import devices as devices
     from clra.ops.projector import BackProjector as BackProjector
     from clra.ops.projector import ForwardProjector as ForwardProjector
 
@@ -40,7 +40,7 @@ _HOMES = {
     "align": "clra.methods.alignment",
     "reconstruct": "clra.methods.reconstruction",
     "correct": "clra.methods.correction",
-    "devices": "clra.ops.opencl",
+    "devices": "clra.ops.devices",
     "ForwardProjector": "clra.ops.projector",
     "BackProjector": "clra.ops.projector",
     "AlignmentStep": "clra.ops.alignment_step",

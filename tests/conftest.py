@@ -8,11 +8,12 @@ import pyopencl as cl
 import pytest
 
 from clra.ops import opencl
+from clra.ops.devices import create_context
 
 
 @pytest.fixture(scope="session")
 def context() -> Iterator[cl.Context]:
-    context = opencl.create_context()
+    context = create_context()
     builds = opencl.builds(context)  # held, so that the tests compile once
     yield context
     del builds

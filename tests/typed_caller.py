@@ -11,7 +11,7 @@ import pyopencl.array as cl_array
 
 import clra
 from clra.methods.results import AlignmentResult
-from clra.ops.opencl import DeviceInfo
+from clra.ops.devices import DeviceInfo
 from clra.ops.registration import ESTIMATE_FIELDS
 from clra.ops.warp import Warp
 

@@ -21,7 +21,7 @@ from bench_cases import CASES, LONG, Bench, Case, Value
 from bench_first_use import first_use
 from bench_peers import PEERS, Peer, threads
 
-from clra.ops import opencl
+from clra.ops.devices import create_context
 
 
 def measured(case: Case, repeats: int) -> Value:
@@ -103,7 +103,7 @@ def main() -> None:
     names = given.only or [*short, *(LONG if given.long else ())]
     peers = found(given.peer)
     columns = [peer.name for peer in peers]
-    queue = cl.CommandQueue(opencl.create_context(given.device))
+    queue = cl.CommandQueue(create_context(given.device))
     about = machine(queue.device)
     print(f"{about['device']}, {about['driver']}, {about['threads']} threads\n")
     print(head(columns), flush=True)

@@ -31,7 +31,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array
 import clra
-from clra.ops import opencl
+from clra.ops.devices import create_context
 random = np.random.default_rng(0)
 geometry = clra.circular(16, source_to_axis=100.0, source_to_detector=150.0, pixel_size=0.6,
                          shape=(64, 64))
@@ -46,7 +46,7 @@ clra.correct(scan, result.motion).read(0, 4)
 for method in "fbp", "osem-tr", "imgr":
     clra.reconstruct(scan, method=method, grid=grid)
 clra.reconstruct(turns, method="katsevich", grid=clra.VolumeGrid(shape=(9, 32, 32), voxel_size=0.5))
-queue = cl.CommandQueue(opencl.create_context(None))
+queue = cl.CommandQueue(create_context(None))
 projections = cl.array.zeros(queue, (16, 64, 64), np.float32)
 volume = cl.array.zeros(queue, grid.shape, np.float32)
 for tilted in False, True:

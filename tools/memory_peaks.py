@@ -121,12 +121,12 @@ def predicted(method: str, path: Path, host: int, device: int) -> Any:
     import clra
     from clra.methods.needs import alignment_need, multigrid_need, reconstruction_need
     from clra.model.grid import default_grid
-    from clra.ops import opencl
+    from clra.ops.devices import choose_device
     from clra.ops.memory import Budgets
 
     geometry = clra.read_scan(path).geometry
     grid = default_grid(geometry)
-    budgets = Budgets.of(opencl.choose_device(), device, host)
+    budgets = Budgets.of(choose_device(), device, host)
     if method == "align":
         quarter, half = (alignment_need(budgets, geometry, grid, level) for level in (4, 2))
         return quarter.beside(half)

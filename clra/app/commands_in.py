@@ -22,11 +22,11 @@ def devices(console: Console) -> None:
       clra devices
       clra devices --device pocl
     """
-    from clra.ops import opencl
+    from clra.ops import devices
 
-    found = opencl.devices()
-    chosen = opencl.choose_device(console.device)  # refuses where there is none
-    taken = [info.index for info in found if opencl.choose_device(info.index) == chosen][:1]
+    found = devices.devices()
+    chosen = devices.choose_device(console.device)  # refuses where there is none
+    taken = [info.index for info in found if devices.choose_device(info.index) == chosen][:1]
     lines = [
         f"{'*' if info.index in taken else ' '} {info.index:<5}{info.kind:<6}{info.name}: "
         f"{info.compute_units} units, {info.memory / 2**30:.1f} GiB "
@@ -52,7 +52,7 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
     from clra.app.describe import Facts, table
     from clra.app.estimate import costs_of, costs_table
     from clra.app.speed import Speed, measure
-    from clra.ops.opencl import NoDeviceError
+    from clra.ops.devices import NoDeviceError
 
     limits = memory.limits()
     opened = reading.scan(scan)

@@ -194,7 +194,7 @@ def _imgr(
     from clra.methods.imgr import imgr
     from clra.methods.iterative import sorted_options
     from clra.methods.multigrid import ReconstructionInterrupted
-    from clra.ops.opencl import choose_devices
+    from clra.ops.devices import choose_devices
     from clra.ops.streaming import Stream
 
     osem, cycle = sorted_options("imgr", options)

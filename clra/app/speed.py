@@ -104,7 +104,7 @@ def measure(
     geometry : ConeBeamGeometry
         Of the scan.
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
+        As :func:`clra.ops.devices.choose_device` takes it.
     report : callable, optional
         Told how far the test is.
     max_device_memory, max_host_memory : int, optional

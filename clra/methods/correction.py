@@ -31,7 +31,7 @@ def correct(
     motion : Motion
         Of its views, as :func:`clra.align` found it.
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
+        As :func:`clra.ops.devices.choose_device` takes it.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 

@@ -14,7 +14,7 @@ from clra.methods.sharing import on_devices
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.opencl import choose_devices
+from clra.ops.devices import choose_devices
 from clra.ops.streaming import HostPlanes, PlaneWriter, Radiographs, Report, Stream
 
 METHODS = ("fbp", "katsevich", *iterative.METHODS)
@@ -54,7 +54,7 @@ def reconstruct(
         Estimate the motion first, with the defaults of :func:`clra.align`; "imgr" does so on the
         way.
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it, or "all" to share the work out to all
+        As :func:`clra.ops.devices.choose_device` takes it, or "all" to share the work out to all
         devices of the best kind; alignment and iterative methods take the first of them.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.

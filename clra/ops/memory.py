@@ -13,6 +13,10 @@ from clra.ops import opencl
 Floats = NDArray[np.float32]
 
 
+class DeviceMemoryError(RuntimeError):
+    """Work that does not fit on the device; the message says what would."""
+
+
 def host_memory() -> int:
     """Bytes of memory that this machine has free for us (Linux; elsewhere 4 GiB)."""
     try:
@@ -134,7 +138,7 @@ class DeviceMemory:
             If that is more than the budget leaves.
         """
         if self.taken + size > self.budget:
-            raise opencl.DeviceMemoryError(
+            raise DeviceMemoryError(
                 f"{_mib(self.taken + size)} of device memory are needed, "
                 f"{_mib(self.budget)} are allowed: raise --max-device-memory "
                 "or --max-host-memory, or use a coarser grid"

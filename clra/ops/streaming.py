@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.ops import opencl
-from clra.ops.memory import Budgets, DeviceMemory, HostRoom, Store
+from clra.ops.devices import choose_device
+from clra.ops.memory import Budgets, DeviceMemory, DeviceMemoryError, HostRoom, Store
 from clra.ops.pyramid import Restrict2D
 from clra.ops.transpose import Planes, Transpose
 
@@ -46,7 +47,7 @@ class Stream:
     Parameters
     ----------
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
+        As :func:`clra.ops.devices.choose_device` takes it.
     max_device_memory, max_host_memory : int, optional
         Bytes; by default 3/4 of the device's memory and half of what the host has available. The
         host's counts what comes on top of the imported modules and built kernels.
@@ -78,7 +79,7 @@ class Stream:
         max_host_memory: int | None = None,
         report: Report | None = None,
     ) -> None:
-        self.device = opencl.choose_device(device)
+        self.device = choose_device(device)
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
         self._builds = opencl.builds(self.context)  # held: operators come and go
@@ -141,7 +142,7 @@ class Stream:
         limit = self.budgets.slab // volumes
         planes = limit // (4 * nx * ny)
         if planes < 1:
-            raise opencl.DeviceMemoryError(
+            raise DeviceMemoryError(
                 f"one plane of {ny} x {nx} voxels takes {4 * nx * ny >> 10} KiB, the device allows "
                 f"{limit >> 10} KiB: use a coarser grid or raise the memory limit"
             )

@@ -85,7 +85,7 @@ def test_a_device_that_is_not_there_fails_with_what_there_is(clra):
 def test_without_any_device_there_is_advice_and_info_still_describes(
     clra, monkeypatch, scan_file, tmp_path
 ):
-    monkeypatch.setattr("clra.ops.opencl._all_devices", list)
+    monkeypatch.setattr("clra.ops.devices._all_devices", list)
     refused(clra("devices"), 1, "PoCL")
     refused(clra("align", scan_file, "-o", tmp_path / "m.h5"), 1, "PoCL")
     code, out, err = clra("info", scan_file)

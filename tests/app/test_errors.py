@@ -6,7 +6,9 @@ import pytest
 
 from clra.app.errors import InterruptedCommandError, _plain_warnings, verdict
 from clra.io.errors import InputError, OutputError
-from clra.ops.opencl import DeviceMemoryError, KernelBuildError, NoDeviceError
+from clra.ops.devices import NoDeviceError
+from clra.ops.memory import DeviceMemoryError
+from clra.ops.opencl import KernelBuildError
 
 
 @pytest.mark.parametrize(

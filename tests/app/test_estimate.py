@@ -8,7 +8,7 @@ from clra.app.simulate import paper_like
 from clra.app.speed import Speed, measure
 from clra.model.grid import default_grid
 from clra.model.trajectory import double_helix
-from clra.ops import opencl
+from clra.ops.devices import choose_device
 from clra.ops.memory import Budgets
 
 SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
@@ -51,7 +51,7 @@ def test_sizes_and_table():
         "2000 TiB",
     ]
     geometry = paper_like("circular", 100, (64, 48))
-    speed = replace(SPEED, budgets=Budgets.of(opencl.choose_device(), 1 << 30, 4 << 30))
+    speed = replace(SPEED, budgets=Budgets.of(choose_device(), 1 << 30, 4 << 30))
     text = costs_table(costs_of(geometry, speed), speed)
     assert "FR" in text and "48 x 48" not in text.splitlines()[0] and "a device" in text
     assert "4 GiB on the host" in text

@@ -11,13 +11,12 @@ import pytest
 import clra
 from clra.model.grid import default_grid
 from clra.model.phantom import porous
-from clra.ops import opencl
 
 SAME = 1e-4  # of the largest attenuation
 
 
 def test_every_device_gives_the_same():
-    devices = [info.index for info in opencl.devices()]
+    devices = [info.index for info in clra.devices()]
     if len(devices) == 1:
         pytest.skip("one device only")
     geometry = clra.double_helix(

@@ -9,7 +9,7 @@ import pytest
 
 import clra
 from clra.methods.sharing import on_devices
-from clra.ops import opencl
+from clra.ops.devices import NoDeviceError, choose_device
 
 TWICE = """
 import sys
@@ -17,9 +17,9 @@ import numpy as np
 import clra
 from clra.app.simulate import paper_like, sample, simulated_scan
 from clra.methods import sharing
-from clra.ops import opencl
+from clra.ops.devices import choose_devices
 
-devices = opencl.choose_devices("all")
+devices = choose_devices("all")
 if len(devices) < 2:
     print("one device")
     sys.exit()
@@ -64,7 +64,7 @@ def test_the_first_failure_is_told():
     def work(stream, planes, target):
         raise ValueError(f"plane {planes.start}")
 
-    device = opencl.choose_device()
+    device = choose_device()
     with pytest.raises(ValueError, match="plane"):
         on_devices([device, device], work, 7, None)
 
@@ -80,7 +80,7 @@ def test_every_plane_is_taken_once():
         for plane in range(planes.stop - planes.start):
             target.write(plane, [None])
 
-    device = opencl.choose_device()
+    device = choose_device()
     on_devices([device, device, device], work, 23, Target())
     assert sorted(taken) == [(plane, 1) for plane in range(23)]
 
@@ -89,5 +89,5 @@ def test_alignment_takes_one_device():
     geometry = clra.circular(
         4, source_to_axis=50.0, source_to_detector=100.0, pixel_size=1.0, shape=(64, 64)
     )
-    with pytest.raises(opencl.NoDeviceError, match="no OpenCL device 'all'"):
+    with pytest.raises(NoDeviceError, match="no OpenCL device 'all'"):
         clra.align(clra.Scan(np.zeros((4, 64, 64), np.float32), geometry), device="all")

@@ -13,6 +13,7 @@ from operator_cases import CASES, GRID, IMAGES, result
 from clra import kernels
 from clra.kernels.header import signatures
 from clra.ops import correlation, opencl
+from clra.ops.devices import choose_device
 from clra.ops.multigrid import add_update, cropped
 from clra.ops.slabs import volume_from
 from clra.ops.steps import Step
@@ -38,7 +39,7 @@ def test_forms_for_cpu_and_gpu_agree(name, context, queue, monkeypatch):
 
 def go_through_a_stream() -> None:
     """What works on volumes in slabs instead of on arrays."""
-    stream = Stream(opencl.choose_device())
+    stream = Stream(choose_device())
     volume = volume_from(stream, GRID, np.ones(GRID.shape, np.float32))
     add_update(stream, volume, cropped(stream, volume, 0, GRID))
     assert (volume.to_host() == 2).all()

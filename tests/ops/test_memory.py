@@ -7,12 +7,13 @@ import pyopencl as cl
 import pytest
 
 from clra.ops import opencl
-from clra.ops.memory import Budgets, DeviceMemory, HostRoom, Reused, Store
+from clra.ops.devices import create_context
+from clra.ops.memory import Budgets, DeviceMemory, DeviceMemoryError, HostRoom, Reused, Store
 
 
 @pytest.fixture(scope="module")
 def context():
-    return opencl.create_context()
+    return create_context()
 
 
 def test_device_memory_is_counted_and_given_back(context):
@@ -30,7 +31,7 @@ def test_more_than_the_budget_says_what_to_do(context):
     memory = DeviceMemory(context, 3 << 20)
     kept = memory(2 << 20)
     with pytest.raises(
-        opencl.DeviceMemoryError,
+        DeviceMemoryError,
         match=r"4 MiB.* needed, 3 MiB are allowed: raise --max-device-memo",
     ):
         memory(2 << 20)

@@ -1,12 +1,10 @@
-"""Devices, builds, argument checks; and the cure for PoCL on CPUs it does not know."""
+"""Builds, argument checks; and the cure for PoCL on CPUs it does not know."""
 
 import io
 import struct
 import time
-import types
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -16,44 +14,6 @@ import pytest
 from clra import kernels
 from clra.ops import opencl, pocl
 from clra.ops.pyramid import Restrict2D
-
-
-def test_devices_are_listed_and_can_be_chosen_by_what_is_listed(context):
-    listed = opencl.devices()
-    assert listed
-    for info in listed:
-        assert opencl.choose_device(info.index).name.strip() == info.name
-        assert info.largest_buffer <= info.memory
-        assert info.kind in ("GPU", "CPU", "other")
-
-
-def test_unknown_device_lists_what_was_found():
-    with pytest.raises(opencl.NoDeviceError, match=r"no OpenCL device 'voodoo'; found \d+:0 "):
-        opencl.choose_device("voodoo")
-
-
-def test_argument_beats_clra_device_beats_pyopencl_ctx(monkeypatch):
-    monkeypatch.setenv("PYOPENCL_CTX", "nothing like it")
-    first = opencl.devices()[0].index
-    monkeypatch.setenv("CLRA_DEVICE", first)
-    assert opencl.choose_device() == opencl.choose_device(first)
-    monkeypatch.setenv("CLRA_DEVICE", "also nothing")
-    assert opencl.choose_device(first)
-    with pytest.raises(opencl.NoDeviceError, match="also nothing"):
-        opencl.choose_device()
-    monkeypatch.delenv("CLRA_DEVICE")
-    with pytest.raises(opencl.NoDeviceError, match="nothing like it"):
-        opencl.choose_device()
-
-
-def test_no_device_at_all_says_how_to_get_one(monkeypatch):
-    def none():
-        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
-
-    monkeypatch.setattr(cl, "get_platforms", none)
-    with pytest.raises(opencl.NoDeviceError, match=r"pip install 'clra\[pocl\]'"):
-        opencl.choose_device()
-    assert opencl.devices() == []
 
 
 def test_build_is_cached_and_a_kernel_is_not(context):
@@ -90,37 +50,6 @@ def test_threads_compile_once(context, monkeypatch):
         programs = list(pool.map(lambda one: one.program("warp.cl"), held))
     assert compiled == ["warp.cl"]
     assert len(set(map(id, programs))) == 1
-
-
-@dataclass(frozen=True)
-class Driver:
-    """As much of a device and its platform as the choice asks for."""
-
-    version: str
-    name: str = "pthread-AMD EPYC"
-    max_compute_units: int = 2
-    type: int = cl.device_type.CPU
-
-    @property
-    def platform(self) -> types.SimpleNamespace:
-        name = "Portable Computing Language"
-        return types.SimpleNamespace(name=name, version=self.version, get_devices=lambda: [self])
-
-
-@pytest.mark.parametrize("swapped", [False, True])
-def test_of_two_drivers_of_one_name_the_newer_unless_asked(monkeypatch, swapped):
-    old, new = Driver("OpenCL 3.0 PoCL 3.1+debian"), Driver("OpenCL 3.0 PoCL 10.0")
-    drivers = [new, old] if swapped else [old, new]
-    monkeypatch.setattr(cl, "get_platforms", lambda: [one.platform for one in drivers])
-    monkeypatch.delenv("CLRA_DEVICE", raising=False)
-    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
-    assert opencl.choose_device() is new
-    assert opencl.choose_device("pocl 3.1") is old
-    assert opencl.choose_device(f"{drivers.index(old)}:0") is old
-    with pytest.raises(
-        opencl.NoDeviceError, match=r"PoCL 3\.1\+debian.*PoCL 10|PoCL 10.*PoCL 3\.1"
-    ):
-        opencl.choose_device("pocl 7")
 
 
 def test_a_kernel_that_does_not_compile_raises_with_the_log(context, monkeypatch):

@@ -8,7 +8,7 @@ import pyopencl as cl
 import pytest
 from operator_cases import CASES, result
 
-from clra.ops import opencl
+from clra.ops.devices import choose_device, devices
 
 SAME = 1e-5  # of the largest value
 
@@ -16,8 +16,8 @@ SAME = 1e-5  # of the largest value
 @pytest.fixture(scope="module")
 def others(context) -> list[cl.Context]:
     """A context for each device but the default one."""
-    devices = [opencl.choose_device(info.index) for info in opencl.devices()]
-    found = [cl.Context([device]) for device in devices if device != context.devices[0]]
+    listed = [choose_device(info.index) for info in devices()]
+    found = [cl.Context([device]) for device in listed if device != context.devices[0]]
     if not found:
         pytest.skip("one device only")
     return found

@@ -7,6 +7,7 @@ import clra
 from clra.methods.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid
 from clra.ops import opencl
+from clra.ops.memory import DeviceMemoryError
 from clra.ops.streaming import Radiographs, Stream, Volume
 
 PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
@@ -36,7 +37,7 @@ def test_slabs_fit_and_cover():
 
 def test_a_plane_too_large_says_what_to_do():
     stream = Stream(max_device_memory=1 << 20)
-    with pytest.raises(opencl.DeviceMemoryError, match="coarser grid or raise the memory limit"):
+    with pytest.raises(DeviceMemoryError, match="coarser grid or raise the memory limit"):
         stream.slabs(VolumeGrid(shape=(2, 1000, 1000), voxel_size=1.0))
 
 
