@@ -8,7 +8,6 @@ from clra import kernels
 _KERNEL = re.compile(r"^kernel\b.*\bvoid (\w+)\($")
 # By the house's rule an argument is one line: type, name, and what it is.
 _ARGUMENT = re.compile(r"^ +(?P<type>[^,]*?)(?P<name>\w+)[,)] *(?:// *(?P<meaning>.*))?$")
-_DIRECTIVE = re.compile(r"^#(if|ifdef|ifndef|else|endif)\b *(.*)$")
 
 
 @dataclass(frozen=True)
@@ -40,16 +39,12 @@ class Signature:
         Of the function.
     file : str
         That it is in.
-    condition : str
-        Of the preprocessor, on which there is such a kernel, for example ``"LANES == 8"``; mostly
-        empty.
     arguments : tuple of Argument
         In order.
     """
 
     name: str
     file: str
-    condition: str
     arguments: tuple[Argument, ...]
 
 
@@ -72,12 +67,9 @@ def signatures(file: str) -> tuple[Signature, ...]:
         If there is no such file, or an argument is not one line.
     """
     found: list[Signature] = []
-    conditions: list[str] = []
     lines = iter(kernels.source(file).splitlines())
     for line in lines:
-        if directive := _DIRECTIVE.match(line):
-            _follow(conditions, *directive.groups())
-        elif kernel := _KERNEL.match(line):
+        if kernel := _KERNEL.match(line):
             arguments = []
             for declaration in lines:
                 if declaration == "{":
@@ -87,20 +79,8 @@ def signatures(file: str) -> tuple[Signature, ...]:
                     raise ValueError(f"{file}: found {declaration!r}, expected one argument")
                 kind, name, meaning = argument.group("type", "name", "meaning")
                 arguments.append(Argument(kind.strip(), name, meaning or ""))
-            condition = " && ".join(conditions)
-            found.append(Signature(kernel.group(1), file, condition, tuple(arguments)))
+            found.append(Signature(kernel.group(1), file, tuple(arguments)))
     return tuple(found)
-
-
-def _follow(conditions: list[str], directive: str, condition: str) -> None:
-    """Keep account of the conditions that a line stands under."""
-    if directive == "endif":
-        conditions.pop()
-    elif directive == "else":
-        conditions[-1] = f"!({conditions[-1]})"
-    else:
-        form = {"if": "{}", "ifdef": "defined({})", "ifndef": "!defined({})"}[directive]
-        conditions.append(form.format(condition))
 
 
 def header() -> str:
@@ -136,9 +116,8 @@ _PREAMBLE = """\
 
 def _declarations(signature: Signature) -> str:
     prefix = f"CLRA_{signature.name.upper()}"
-    only = f", only where {signature.condition}" if signature.condition else ""
     lines = [
-        f"/* {signature.name} in {signature.file}{only} */",
+        f"/* {signature.name} in {signature.file} */",
         f'#define {prefix} "{signature.name}"',
         f'#define {prefix}_FILE "{signature.file}"',
         "enum {",
