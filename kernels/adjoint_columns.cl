@@ -5,22 +5,13 @@
 // A work-item sums BLOCK voxels along z of WIDTH neighbouring columns over the given views. Every
 // voxel, and the one beyond, has to be in front of every source.
 
-#ifndef LANES
-#define LANES 8
-#endif
+#include "blocks.clh"
 
-#include "geometry.clh"
-#include "pieces.clh"
-
-#ifndef BLOCK
-#define BLOCK (32 * LANES) // whole LANES
-#endif
 #ifndef WIDTH
 #define WIDTH 16
 #endif
 
-// Rounding must not leave out a ray that shares in a voxel; one ray too many has no weight.
-#define SLACK 1e-2f
+#define SLACK 1e-2f // as in adjoint.cl
 
 // Adds what one detector column gives to `voxels` voxels of two neighbouring columns. The voxels
 // are `slope` rows apart and the first is at `row`; a row shares in voxels within |slope| rows.

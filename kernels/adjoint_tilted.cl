@@ -7,22 +7,13 @@
 // A work-item sums BLOCK voxels along z of WIDTH neighbouring lines over the given views. Every
 // voxel, and the one beyond, has to be in front of every source.
 
-#ifndef LANES
-#define LANES 8
-#endif
+#include "blocks.clh"
 
-#include "geometry.clh"
-#include "pieces.clh"
-
-#ifndef BLOCK
-#define BLOCK (32 * LANES) // whole LANES
-#endif
 #ifndef WIDTH
 #define WIDTH 16
 #endif
 
-// Rounding must not leave out a ray that shares in a voxel; one ray too many has no weight.
-#define SLACK 1e-2f
+#define SLACK 1e-2f // as in adjoint.cl
 
 // More rows a voxel than this, and rays are treated one by one.
 #define MANY 1.4f

@@ -5,16 +5,7 @@
 // A work-item sums BLOCK voxels along z over the given views. Every voxel has to be in front of
 // every source (g > 0).
 
-#ifndef LANES
-#define LANES 8
-#endif
-
-#include "geometry.clh"
-#include "pieces.clh"
-
-#ifndef BLOCK
-#define BLOCK (32 * LANES) // whole LANES
-#endif
+#include "blocks.clh"
 
 // Lines along x that are treated for all y before going on: so what they see of the projections
 // stays in the cache. Half or twice as many change nothing; all of 448 halve the speed for 16

@@ -6,22 +6,11 @@
 // A work-item sums BLOCK voxels along z over the given views. Every voxel has to be in front of
 // every source (g > 0).
 
-#ifndef LANES
-#define LANES 8
-#endif
-
+#include "blocks.clh"
 #include "panel.clh"
-#include "pieces.clh"
 
-#ifndef BLOCK
-#define BLOCK (32 * LANES) // whole LANES
-#endif
-
-// Lines along x that are treated for all y before going on: so what they see of the projections
-// stays in the cache. Half or twice as many change nothing; all of 448 halve the speed for 16
-// views.
 #ifndef STRIP
-#define STRIP 32
+#define STRIP 32 // as in backproject_columns.cl
 #endif
 
 // Adds what one view gives to `voxels` voxels from (x, y, z) on along z.

@@ -7,16 +7,7 @@
 // parts that stay in the cache for all views. Every voxel, and the one beyond, has to be in front
 // of every source.
 
-#ifndef LANES
-#define LANES 8
-#endif
-
-#include "geometry.clh"
-#include "pieces.clh"
-
-#ifndef BLOCK
-#define BLOCK (32 * LANES) // whole LANES
-#endif
+#include "blocks.clh"
 
 // Global size (blocks, columns, count), rounded up at will.
 kernel void forward_columns(

@@ -7,16 +7,8 @@
 // axis. Across z, along which lines cannot be read at once, rays are traced one by one. Planes are
 // as for forwardproject_columns.cl.
 
-#ifndef LANES
-#define LANES 8
-#endif
-
+#include "blocks.clh"
 #include "rays.clh"
-#include "pieces.clh"
-
-#ifndef BLOCK
-#define BLOCK (32 * LANES) // whole LANES
-#endif
 
 // Adds what the rays (c, r + from) to (c, r + stop - 1) collect across axis p, x or y. The slopes
 // are those of rays (c, r) and on in q, the other one, and in z.
