@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clra.app.describe import Facts, table
 from clra.app.progress import duration
 from clra.app.records import Record
-from clra.model.gauge import gauge_fit, sample_points
+from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -57,7 +57,7 @@ class Errors:
             magnification=1 + (motion.magnification - truth.magnification),
         )
         points = sample_points(default_grid(scan.geometry))
-        fit = gauge_fit(scan.geometry, difference, points, magnification=record.scale_estimated)
+        fit = Gauge(scan.geometry, points, magnification=record.scale_estimated).fit(difference)
         return cls(raw=fit.part + fit.remainder, gauge_free=fit.remainder)
 
     def means(self) -> dict[str, float]:

@@ -213,13 +213,6 @@ class Gauge:
         )
 
 
-def gauge_fit(
-    geometry: ConeBeamGeometry, motion: Motion, points: ArrayLike, *, magnification: bool = True
-) -> GaugeFit:
-    """Fit the gauge modes to one motion; arguments as of :class:`Gauge`."""
-    return Gauge(geometry, points, magnification=magnification).fit(motion)
-
-
 def _modes(magnification: bool) -> tuple[str, ...]:
     """Scale belongs to the gauge only where magnification is estimated."""
     return GAUGE_MODES if magnification else tuple(mode for mode in GAUGE_MODES if mode != "scale")
@@ -287,18 +280,6 @@ class MotionError:
         """Return the mean absolute errors alone, by name."""
         names = ("mae_u", "mae_v", "mae_m", "gauge_free_u", "gauge_free_v", "gauge_free_m")
         return {name: getattr(self, name) for name in names}
-
-
-def motion_error(
-    estimate: Motion,
-    truth: Motion,
-    geometry: ConeBeamGeometry,
-    points: ArrayLike,
-    *,
-    magnification: bool = True,
-) -> MotionError:
-    """Compare one estimated motion with the true one; arguments as of :class:`Gauge`."""
-    return Gauge(geometry, points, magnification=magnification).error(estimate, truth)
 
 
 def without_gauge(

@@ -11,7 +11,7 @@ from clra.app.simulate import (
     simulated_scan,
 )
 from clra.model import trajectory
-from clra.model.gauge import gauge_fit, sample_points
+from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 
@@ -48,11 +48,11 @@ def test_motions_keep_about_their_range_and_have_no_gauge(kind):
     motion = simulated_motion(kind, geometry, shift=SHIFT, magnification=0.001, seed=3)
     assert np.abs(motion.shift_u).max() < 1.5 * 10
     assert (kind == "none") == (motion == Motion.identity(60))
-    fit = gauge_fit(geometry, motion, sample_points(default_grid(geometry)))
+    fit = Gauge(geometry, sample_points(default_grid(geometry))).fit(motion)
     kept = simulated_motion(
         kind, geometry, shift=SHIFT, magnification=0.001, seed=3, keep_gauge=True
     )
-    fit_of_kept = gauge_fit(geometry, kept, sample_points(default_grid(geometry)))
+    fit_of_kept = Gauge(geometry, sample_points(default_grid(geometry))).fit(kept)
     if kind != "none":
         assert np.abs(fit.part[:, :2]).max() < 0.05 * np.abs(fit_of_kept.part[:, :2]).max()
 

@@ -7,7 +7,7 @@ import pytest
 
 import clra
 from clra.methods.alignment import AlignmentInterrupted
-from clra.model.gauge import Gauge, motion_error, sample_points, without_gauge
+from clra.model.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
 from clra.model.perturbation import random_motion, smooth_motion
 from clra.model.phantom import porous
@@ -55,7 +55,7 @@ def result(moved):
 
 def test_motion_is_found(moved, result):
     points = sample_points(default_grid(moved.geometry))
-    error = motion_error(result.motion, moved.truth, moved.geometry, points)
+    error = Gauge(moved.geometry, points).error(result.motion, moved.truth)
     assert error.gauge_free_u < TOLERANCE
     assert error.gauge_free_v < TOLERANCE
     # Panels of 128 columns hardly tell magnifications of 0.1 %: what counts is no drift of it.

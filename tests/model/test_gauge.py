@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from clra.model.gauge import Gauge, gauge_fit, motion_error, sample_points, without_gauge
+from clra.model.gauge import Gauge, sample_points, without_gauge
 from clra.model.gauge_modes import GAUGE_MODES, gauge_columns
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
@@ -133,7 +133,7 @@ COEFFICIENTS = np.array([0.02, -0.01, 0.03, 0.002, 0.003, 0.004, -0.002])
 
 
 def test_a_motion_of_the_sample_is_all_gauge(scan, points):
-    fit = gauge_fit(scan, gauge_motion(scan, points, COEFFICIENTS), points)
+    fit = Gauge(scan, points).fit(gauge_motion(scan, points, COEFFICIENTS))
     np.testing.assert_allclose(fit.remainder, 0, atol=ROUNDING)
     np.testing.assert_allclose(list(fit.coefficients.values()), COEFFICIENTS, atol=1e-7)
     assert tuple(fit.coefficients) == tuple(fit.rms_by_mode) == GAUGE_MODES
@@ -141,35 +141,33 @@ def test_a_motion_of_the_sample_is_all_gauge(scan, points):
 
 def test_remainder_is_what_no_mode_can_make_smaller(scan, points):
     motion = random_motion(97, seed=1, magnification=1e-3)
-    fit = gauge_fit(scan, motion, points)
+    fit = Gauge(scan, points).fit(motion)
     table = np.stack([motion.shift_u, motion.shift_v, motion.magnification - 1], axis=1)
     np.testing.assert_allclose(fit.part + fit.remainder, table, atol=ROUNDING)
     pixels = np.array([1, 1, 0.25 * math.hypot(61, 67)])
     columns = gauge_columns(scan, points).reshape(3, 97, 7) * pixels[:, None, None]
     left = np.einsum("vk,kvm->m", fit.remainder * pixels, columns)
     np.testing.assert_allclose(left / np.abs(columns).sum(axis=(0, 1)), 0, atol=ROUNDING)
-    again = gauge_fit(
-        scan,
-        Motion(shift_u=fit.part[:, 0], shift_v=fit.part[:, 1], magnification=1 + fit.part[:, 2]),
-        points,
+    again = Gauge(scan, points).fit(
+        Motion(shift_u=fit.part[:, 0], shift_v=fit.part[:, 1], magnification=1 + fit.part[:, 2])
     )
     np.testing.assert_allclose(again.part, fit.part, atol=ROUNDING)
 
 
 def test_without_magnification_neither_scale_nor_dm_is_fitted(scan, points):
     motion = smooth_motion(97, seed=1, magnification=1e-3)
-    fit = gauge_fit(scan, motion, points, magnification=False)
+    fit = Gauge(scan, points, magnification=False).fit(motion)
     assert tuple(fit.coefficients) == tuple(m for m in GAUGE_MODES if m != "scale")
     np.testing.assert_array_equal(fit.part[:, 2], 0)
     np.testing.assert_allclose(fit.remainder[:, 2], motion.magnification - 1, atol=ROUNDING)
     still = Motion(shift_u=motion.shift_u, shift_v=motion.shift_v)
-    other = gauge_fit(scan, still, points, magnification=False)
+    other = Gauge(scan, points, magnification=False).fit(still)
     np.testing.assert_array_equal(other.part, fit.part)
 
 
 def test_rms_by_mode_is_in_pixels_of_that_mode(scan, points):
     motion = gauge_motion(scan, points, np.array([0, 0, 0.03, 0, 0, 0, 0]))
-    fit = gauge_fit(scan, motion, points)
+    fit = Gauge(scan, points).fit(motion)
     quarter = 0.25 * math.hypot(61, 67)
     length = motion.shift_u**2 + motion.shift_v**2 + (quarter * (motion.magnification - 1)) ** 2
     assert fit.rms_by_mode["translation z"] == pytest.approx(math.sqrt(length.mean()))
@@ -178,7 +176,7 @@ def test_rms_by_mode_is_in_pixels_of_that_mode(scan, points):
 
 def test_a_wrong_centre_of_rotation_is_no_gauge(scan, points):
     aside = Motion(shift_u=np.full(97, 1.0), shift_v=np.zeros(97))
-    error = motion_error(aside, Motion.identity(97), scan, points)
+    error = Gauge(scan, points).error(aside, Motion.identity(97))
     assert error.mae_u == 1
     assert error.gauge_free_u > 0.98
 
@@ -191,7 +189,7 @@ def test_error_is_raw_and_gauge_free(scan, points):
         shift_v=truth.shift_v + gauge.shift_v,
         magnification=truth.magnification + gauge.magnification - 1,
     )
-    error = motion_error(estimate, truth, scan, points)
+    error = Gauge(scan, points).error(estimate, truth)
     assert error.mae_u == pytest.approx(np.abs(gauge.shift_u).mean())
     assert error.mae_v == pytest.approx(np.abs(gauge.shift_v).mean())
     assert error.mae_m == pytest.approx(np.abs(gauge.magnification - 1).mean())
@@ -199,15 +197,15 @@ def test_error_is_raw_and_gauge_free(scan, points):
     for name in ("u", "v", "m", "std_u", "std_v", "std_m"):
         assert getattr(error, f"gauge_free_{name}") < ROUNDING
     with pytest.raises(ValueError, match="estimate: found 96 views, expected 97"):
-        motion_error(estimate.subset(slice(96)), truth, scan, points)
+        Gauge(scan, points).error(estimate.subset(slice(96)), truth)
 
 
 def test_errors_do_not_depend_on_the_unit_of_length(scan, points):
     motion = smooth_motion(97, seed=3, magnification=1e-3)
-    expected = motion_error(motion, Motion.identity(97), scan, points)
+    expected = Gauge(scan, points).error(motion, Motion.identity(97))
     for unit in (1e-6, 1e3):
         scaled = ConeBeamGeometry.from_astra(scan.to_astra() * unit, scan.shape)
-        found = motion_error(motion, Motion.identity(97), scaled, points * unit)
+        found = Gauge(scaled, points * unit).error(motion, Motion.identity(97))
         assert vars(found) == pytest.approx(vars(expected), rel=1e-6)
 
 
@@ -218,7 +216,7 @@ def test_without_gauge_leaves_a_truth_that_errors_cannot_hide_in(scan, magnifica
     moved = smooth_motion(97, seed=4, magnification=2e-3 * magnification)
     truth = without_gauge(moved, scan, clouds, magnification)
     before, after = (
-        np.abs(gauge_fit(scan, motion, sample_points(grid), magnification=magnification).part)
+        np.abs(Gauge(scan, sample_points(grid), magnification=magnification).fit(motion).part)
         for motion in (moved, truth)
     )
     assert before[:, :2].max() > 3
@@ -244,13 +242,13 @@ def test_one_view_and_a_circle_have_a_gauge():
     for geometry in (circular(1, **STAGE), circular(12, **STAGE)):
         cloud = sample_points(default_grid(geometry), count=100)
         motion = random_motion(geometry.views, seed=0, magnification=1e-3)
-        fit = gauge_fit(geometry, motion, cloud)
+        fit = Gauge(geometry, cloud).fit(motion)
         assert np.isfinite(fit.remainder).all()
         assert np.linalg.norm(fit.remainder[:, :2]) < np.linalg.norm(
             [motion.shift_u, motion.shift_v]
         )
     with pytest.raises(ValueError, match="motion: found 1 views, expected 12"):
-        gauge_fit(geometry, Motion.identity(1), cloud)
+        Gauge(geometry, cloud).fit(Motion.identity(1))
 
 
 def test_sample_points_fill_the_cylinder_of_the_grid():

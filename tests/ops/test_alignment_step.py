@@ -6,7 +6,7 @@ import pyopencl.array as cl_array
 import pytest
 
 import clra
-from clra.model.gauge import motion_error, sample_points, without_gauge
+from clra.model.gauge import Gauge, sample_points, without_gauge
 from clra.model.perturbation import random_motion
 from clra.model.phantom import porous
 from clra.ops.registration import ESTIMATE_FIELDS
@@ -55,7 +55,7 @@ def test_repeated_it_finds_the_motion(context, queue, truth):
         step.set_geometry(GEOMETRY.with_motion(motion))
         estimates, _ = once(step, queue, measured)
         motion = motion.then(clra.Motion(shift_u=estimates[:, 0], shift_v=estimates[:, 1]))
-        error = motion_error(motion, truth, GEOMETRY, sample_points(GRID))
+        error = Gauge(GEOMETRY, sample_points(GRID)).error(motion, truth)
         errors.append((error.gauge_free_u, error.gauge_free_v))
     assert errors[-1][0] < FOUND_U
     assert errors[-1][1] < FOUND_V
