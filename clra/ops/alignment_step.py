@@ -13,6 +13,7 @@ from clra.model.grid import VolumeGrid
 from clra.ops import opencl
 from clra.ops.coverage import Coverage
 from clra.ops.filtering import FADE, RampFilter, taper
+from clra.ops.layout import volume_shape
 from clra.ops.projector import BackProjector, ForwardProjector
 from clra.ops.registration import ESTIMATE_FIELDS, Registration
 from clra.ops.scratch import Allocator, Scratch, within
@@ -114,9 +115,7 @@ class AlignmentStep:
             spread=spread,
             **within_limits,
         )
-        self._volume_shape = (
-            grid.shape if volume_order == "zyx" else (*grid.shape[1:], grid.shape[0])
-        )
+        self._volume_shape = volume_shape(grid, volume_order)
         operations = (
             self._ramp,
             self._coverage,

@@ -13,6 +13,7 @@ from clra.model.grid import VolumeGrid, field_radii
 from clra.ops import opencl
 from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
+from clra.ops.views import check_geometry
 
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
 # rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
@@ -99,11 +100,7 @@ class Coverage:
         ValueError
             If views or panel differ.
         """
-        found = (geometry.views, geometry.rows, geometry.columns)
-        if found != self._counted:
-            raise ValueError(
-                f"geometry: found {found}, expected {self._counted} as (views, rows, columns)"
-            )
+        check_geometry(geometry, self._counted)
         self._matrices = to_device(self._context, self._coarse_matrices(geometry))
         self._least = _LEAST * _most_views(geometry, self._row_weight)
         radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))

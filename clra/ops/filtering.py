@@ -13,6 +13,7 @@ from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
 from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
+from clra.ops.views import check_geometry, successive
 
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
 
@@ -158,12 +159,7 @@ class RampFilter:
         ValueError
             If views or shape differ.
         """
-        expected = (self._views, self._rows, self._columns)
-        found = (geometry.views, *geometry.shape)
-        if found != expected:
-            raise ValueError(
-                f"geometry: found {found}, expected {expected} as (views, rows, columns)"
-            )
+        check_geometry(geometry, (self._views, self._rows, self._columns))
         self._view_table = to_device(self._context, _view_table(geometry))
 
     def __call__(
@@ -200,9 +196,7 @@ class RampFilter:
             If an argument is none of the above.
         """
         opencl.check_queue(queue, self._context)
-        start, stop, step = (views or slice(None)).indices(self._views)
-        if step != 1 or stop <= start:
-            raise ValueError(f"views: found {views}, expected some successive views")
+        start, stop = successive(views, self._views)
         shape = (stop - start, self._rows, self._columns)
         opencl.check_array("projections", projections, shape, context=self._context)
         opencl.check_array("filtered_out", filtered_out, shape, context=self._context)

@@ -17,8 +17,7 @@ from clra.ops import opencl
 from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import to_device
 from clra.ops.transpose import Planes, Transpose
-
-VOLUME_ORDERS = ("zyx", "yxz")
+from clra.ops.views import check_geometry, successive
 
 _PAD = 24  # as in geometry.clh
 _PIECE = 32  # the most that kernels read from where they are, past the last line's end
@@ -83,9 +82,6 @@ class Layout:
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
     ) -> None:
-        if volume_order not in VOLUME_ORDERS:
-            expected = " or ".join(map(repr, VOLUME_ORDERS))
-            raise ValueError(f"volume_order: found {volume_order!r}, expected {expected}")
         cpu = opencl.is_cpu(opencl.device_of(context))
         self.context = context
         self.grid = grid
@@ -96,9 +92,7 @@ class Layout:
         self._views = geometry.views
         self._tilted = tilted
         self.volume_order = volume_order
-        self._volume_shape = (
-            grid.shape if volume_order == "zyx" else (*grid.shape[1:], grid.shape[0])
-        )
+        self._volume_shape = volume_shape(grid, volume_order)
         self._bytes = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
         self._least = _LEAST_VIEWS if scratch_limit is None else 1
         self._transpose = Transpose(context, min(self.lanes, 8))
@@ -113,12 +107,7 @@ class Layout:
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
         """Take other vectors of the same views and panel."""
-        found = (geometry.views, geometry.rows, geometry.columns)
-        expected = (self._views, self.panel[1], self.panel[0])
-        if found != expected:
-            raise ValueError(
-                f"geometry: found {found}, expected {expected} as (views, rows, columns)"
-            )
+        check_geometry(geometry, (self._views, self.panel[1], self.panel[0]))
         self.table = to_device(self.context, view_table(geometry, self.grid))
         self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
         self.steep = not geometry.axial and _steep(geometry)
@@ -132,9 +121,7 @@ class Layout:
         views: slice | None,
     ) -> tuple[int, int]:
         """Refuse what does not fit; first of the views, and one past the last."""
-        start, stop, step = (slice(None) if views is None else views).indices(self._views)
-        if step != 1 or stop <= start:
-            raise ValueError(f"views: found {views}, expected successive ones of {self._views}")
+        start, stop = successive(views, self._views)
         opencl.check_queue(queue, self.context)
         columns, rows, _ = self.panel
         opencl.check_array(names[0], volume, self._volume_shape, context=self.context)
@@ -244,6 +231,20 @@ class Layout:
             nx, ny, nz = self.sizes
             self._volume = self._memory.empty((ny, nx, nz))
         return self._volume
+
+
+def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
+    """Shape of a volume whose axes are in that order.
+
+    Raises
+    ------
+    ValueError
+        If it is neither "zyx" nor "yxz".
+    """
+    if order not in ("zyx", "yxz"):
+        raise ValueError(f"volume_order: found {order!r}, expected 'zyx' or 'yxz'")
+    nz, ny, nx = grid.shape
+    return (nz, ny, nx) if order == "zyx" else (ny, nx, nz)
 
 
 def _steep(geometry: ConeBeamGeometry) -> bool:

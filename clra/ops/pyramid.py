@@ -12,11 +12,13 @@ from clra.ops.steps import Step
 class _Resampling:
     """One kernel of ``pyramid.cl``, launched over blocks of columns of its output."""
 
-    def __init__(self, context: cl.Context, name: str) -> None:
+    _kernel: str
+
+    def __init__(self, context: cl.Context) -> None:
         self._context = context
         # On a CPU a vector of 8 columns an item is 3 times faster than one column an item.
         self._lanes = 8 if opencl.is_cpu(opencl.device_of(context)) else 2
-        self._step = Step(context, "pyramid.cl", name, (32, 4, 1), {"LANES": self._lanes})
+        self._step = Step(context, "pyramid.cl", self._kernel, (32, 4, 1), {"LANES": self._lanes})
 
     def _launch(
         self,
@@ -42,8 +44,7 @@ class Restrict2D(_Resampling):
         Where the arrays live.
     """
 
-    def __init__(self, context: cl.Context) -> None:
-        super().__init__(context, "restrict_2d")
+    _kernel = "restrict_2d"
 
     def __call__(
         self,
@@ -90,8 +91,7 @@ class Restrict3D(_Resampling):
         Where the arrays live.
     """
 
-    def __init__(self, context: cl.Context) -> None:
-        super().__init__(context, "restrict_3d")
+    _kernel = "restrict_3d"
 
     def __call__(
         self,
@@ -121,8 +121,7 @@ class Prolong3D(_Resampling):
         Where the arrays live.
     """
 
-    def __init__(self, context: cl.Context) -> None:
-        super().__init__(context, "prolong_3d")
+    _kernel = "prolong_3d"
 
     def __call__(
         self,

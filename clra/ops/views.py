@@ -1,0 +1,44 @@
+"""Which views an operator is called for, and whether a geometry is of the views it was made for."""
+
+from clra.model.geometry import ConeBeamGeometry
+
+
+def check_geometry(geometry: ConeBeamGeometry, expected: tuple[int, int, int]) -> None:
+    """Refuse a geometry of other views or another panel.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        To be checked.
+    expected : tuple of int
+        Views, rows and columns.
+
+    Raises
+    ------
+    ValueError
+        If they differ.
+    """
+    found = (geometry.views, geometry.rows, geometry.columns)
+    if found != expected:
+        raise ValueError(f"geometry: found {found}, expected {expected} as (views, rows, columns)")
+
+
+def successive(views: slice | None, total: int) -> tuple[int, int]:
+    """Return the first of the views chosen, and one past the last.
+
+    Parameters
+    ----------
+    views : slice or None
+        Of `total` views; all if None.
+    total : int
+        Number of views of the geometry.
+
+    Raises
+    ------
+    ValueError
+        If these are not one or more successive views.
+    """
+    start, stop, step = (slice(None) if views is None else views).indices(total)
+    if step != 1 or stop <= start:
+        raise ValueError(f"views: found {views}, expected successive ones of {total}")
+    return start, stop
