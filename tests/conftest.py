@@ -24,6 +24,13 @@ def queue(context: cl.Context) -> cl.CommandQueue:
     return cl.CommandQueue(context)
 
 
+@pytest.fixture
+def unordered(context: cl.Context) -> cl.CommandQueue:
+    """A queue that runs what it holds in any order that events allow."""
+    flag = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    return cl.CommandQueue(context, properties=flag)
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder of public real data, which is no part of the repository."""

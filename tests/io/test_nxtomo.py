@@ -4,6 +4,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from geometries import upside_down
 
 from clra.io.nxgeometry import far_source_distance, fields_of
 from clra.io.nxtomo_writing import write_nxtomo
@@ -170,16 +171,6 @@ TRAJECTORIES = {
 }
 
 
-def reversed_rows(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-    return ConeBeamGeometry(
-        source=geometry.source,
-        detector=geometry.detector,
-        u=geometry.u,
-        v=-geometry.v,
-        shape=geometry.shape,
-    )
-
-
 @pytest.mark.parametrize("name", TRAJECTORIES)
 def test_trajectories_survive_with_and_without_our_group(name: str, tmp_path: Path) -> None:
     geometry = TRAJECTORIES[name]
@@ -195,7 +186,7 @@ def test_trajectories_survive_with_and_without_our_group(name: str, tmp_path: Pa
     write_scan(path, Scan(pixels, geometry, truth=truth, mask=mask))
     scan = read_scan(path)
     # The rows of our trajectories count upwards, those of NXtomo downwards.
-    assert scan.geometry == reversed_rows(geometry)
+    assert scan.geometry == upside_down(geometry)
     assert scan.kind == "line-integrals"
     np.testing.assert_array_equal(scan.read(0, len(geometry)), pixels[:, ::-1])
     np.testing.assert_array_equal(scan.mask, mask[::-1])
@@ -215,7 +206,7 @@ def test_trajectories_survive_with_and_without_our_group(name: str, tmp_path: Pa
 
 def test_general_geometry_survives(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    vectors = reversed_rows(TRAJECTORIES["helix"]).to_astra()
+    vectors = upside_down(TRAJECTORIES["helix"]).to_astra()
     vectors += 0.01 * rng.normal(size=vectors.shape)
     geometry = ConeBeamGeometry.from_astra(vectors, (5, 6))
     path = tmp_path / "scan.nxs"
@@ -230,7 +221,7 @@ def test_general_geometry_survives(tmp_path: Path) -> None:
 
 def test_far_source_survives(tmp_path: Path) -> None:
     far = far_source_distance((5, 6), 0.5)
-    geometry = reversed_rows(
+    geometry = upside_down(
         circular(7, **{**PANEL, "source_to_axis": far, "source_to_detector": far})
     )
     assert fields_of(geometry)[1]
@@ -243,7 +234,7 @@ def test_far_source_survives(tmp_path: Path) -> None:
 
 
 def test_marking_a_frame_invalid_keeps_vectors_and_truth_in_step(tmp_path: Path) -> None:
-    geometry = reversed_rows(TRAJECTORIES["helix"])
+    geometry = upside_down(TRAJECTORIES["helix"])
     path = tmp_path / "scan.nxs"
     flats = np.full((2, 5, 6), 1000, np.uint16)
     pixels = np.full((9, 5, 6), 500, np.uint16)

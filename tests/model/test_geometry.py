@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from geometries import tilted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,22 +14,6 @@ from clra.model.motion import Motion
 # Rounding of float64 in pixels of a panel of 1e3, with room for ill-conditioned tilts.
 PIXEL = 1e-8
 SHAPE = (37, 51)
-
-
-def tilted(seed=0, views=5, unit=1.0, shape=SHAPE):
-    """Panels in general position: tilted, skewed and off centre."""
-    random = np.random.default_rng(seed)
-    angle = 2 * np.pi * random.random(views)
-    out = np.stack([np.sin(angle), -np.cos(angle), 0 * angle], axis=1)
-    along = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    noise = random.normal(size=(4, views, 3))
-    return ConeBeamGeometry(
-        source=unit * (20 * out + noise[0]),
-        detector=unit * (-30 * out + noise[1]),
-        u=unit * (0.4 * along + 0.02 * noise[2]),
-        v=unit * (0.4 * np.array([0, 0, 1]) + 0.02 * noise[3]),
-        shape=shape,
-    )
 
 
 def pixel_centre(geometry, column, row):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from geometries import tilted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,22 +13,6 @@ from clra.model.trajectory import PAPER, circular
 
 # float32 rounding of line integrals of a few.
 ROUNDING = 1e-6
-
-
-def tilted(seed=0, views=3, shape=(19, 23)):
-    """Panels in general position, looking at about 4 mm around the origin."""
-    random = np.random.default_rng(seed)
-    angle = 2 * np.pi * random.random(views)
-    out = np.stack([np.sin(angle), -np.cos(angle), 0 * angle], axis=1)
-    along = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    noise = random.normal(size=(4, views, 3))
-    return ConeBeamGeometry(
-        source=10 * out + 0.5 * noise[0],
-        detector=-10 * out + 0.5 * noise[1],
-        u=0.4 * along + 0.03 * noise[2],
-        v=0.4 * np.array([0, 0, 1]) + 0.03 * noise[3],
-        shape=shape,
-    )
 
 
 def rays(geometry, view):

@@ -151,19 +151,16 @@ def test_arrays_with_an_offset_and_fewer_views(context, queue):
     assert not out.get()[[0, 3]].any()
 
 
-def test_out_of_order_queue(context):
-    order = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    queue = cl.CommandQueue(context, properties=order)
+def test_out_of_order_queue(context, queue, unordered):
     operator = Bandpass(context, (64, 64), views=2)
     batches = [images((64, 64), seed=k) for k in range(4)]
-    devices = [cl_array.to_device(queue, batch) for batch in batches]
+    devices = [cl_array.to_device(unordered, batch) for batch in batches]
     outs = [cl_array.empty_like(device) for device in devices]
-    queue.finish()
-    events = [operator(queue, out, one) for out, one in zip(outs, devices, strict=True)]
+    unordered.finish()
+    events = [operator(unordered, out, one) for out, one in zip(outs, devices, strict=True)]
     cl.wait_for_events(events)
-    in_order = cl.CommandQueue(context)
     for out, batch in zip(outs, batches, strict=True):
-        np.testing.assert_array_equal(out.get(queue), run(context, in_order, batch))
+        np.testing.assert_array_equal(out.get(unordered), run(context, queue, batch))
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from operator_cases import CASES, WITH_SCRATCH, Case, result, values
 from clra.ops import fft, opencl
 from clra.ops.fft import RealFFT
 
-OUT_OF_ORDER = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
 OVERHEAD = 0.2e-3  # s, of a call over the bare launch
 
 
@@ -80,25 +79,24 @@ def test_a_call_makes_flushes_and_finishes_no_queue(case, context, queue, monkey
     assert done == []
 
 
-def test_out_of_order_it_waits_for_what_it_is_told(case, context, expected):
+def test_out_of_order_it_waits_for_what_it_is_told(case, context, unordered, expected):
     """Inputs arrive late, behind an event that a host thread completes during the call."""
-    queue = cl.CommandQueue(context, properties=OUT_OF_ORDER)
     operator = case.make(context)
     for _ in range(2):  # the second call must not run into the first one's scratch
-        out = case.empty(queue)  # blocks, until all is done where PoCL is concerned
+        out = case.empty(unordered)  # blocks, until all is done where PoCL is concerned
         late = cl.UserEvent(context)
-        inputs = [cl_array.to_device(queue, np.full_like(host, np.nan)) for host in case.inputs]
+        inputs = [cl_array.to_device(unordered, np.full_like(host, np.nan)) for host in case.inputs]
         # Started first: if no thread can be, nothing waits for it for ever.
         timer = threading.Timer(0.03, late.set_status, [cl.command_execution_status.COMPLETE])
         timer.start()
         arrived = [
-            cl.enqueue_copy(queue, array.base_data, host, wait_for=[late], is_blocking=False)
+            cl.enqueue_copy(unordered, array.base_data, host, wait_for=[late], is_blocking=False)
             for array, host in zip(inputs, case.inputs, strict=True)
         ]
-        event = case.run(operator)(queue, out, *inputs, wait_for=arrived)
+        event = case.run(operator)(unordered, out, *inputs, wait_for=arrived)
         timer.join()
         event.wait()
-        np.testing.assert_array_equal(out.get(queue), expected)
+        np.testing.assert_array_equal(out.get(unordered), expected)
 
 
 def test_arrays_with_an_offset(case, context, queue, expected):

@@ -2,6 +2,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 import pytest
+from arrays import with_offset
 
 from clra.ops import opencl
 from clra.ops.fft import BACKENDS, RealFFT, fast_length
@@ -19,13 +20,6 @@ def compiler(context: cl.Context) -> None:
 
 def image_of(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-
-
-def with_offset(queue: cl.CommandQueue, values: np.ndarray, skip: int = 3) -> cl_array.Array:
-    """An array that starts `skip` elements into its buffer and ends before the buffer does."""
-    padded = np.full(values.size + 2 * skip, 7, values.dtype)
-    padded[skip : skip + values.size] = values.ravel()
-    return cl_array.to_device(queue, padded)[skip : skip + values.size].reshape(values.shape)
 
 
 def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
@@ -107,10 +101,7 @@ def test_many_blocks_are_one_transform(context, queue):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_events_order_an_out_of_order_queue(context, backend):
-    queue = cl.CommandQueue(
-        context, properties=cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    )
+def test_events_order_an_out_of_order_queue(context, unordered, backend):
     shape = (2, 4, 8)
     transform = RealFFT(context, shape, (1, 2), backend)
     image = image_of(shape)
@@ -118,14 +109,16 @@ def test_events_order_an_out_of_order_queue(context, backend):
     spectrum = cl_array.Array(context, transform.spectrum_shape, np.complex64)
     result = np.empty_like(image)
     gate = cl.UserEvent(context)
-    uploaded = cl.enqueue_copy(queue, device.base_data, image, is_blocking=False, wait_for=[gate])
-    gate.set_status(cl.command_execution_status.COMPLETE)
-    event = transform.forward(queue, spectrum, device, wait_for=[uploaded])
-    cleared = cl.enqueue_fill_buffer(
-        queue, device.base_data, np.float32(0), 0, device.nbytes, wait_for=[event]
+    uploaded = cl.enqueue_copy(
+        unordered, device.base_data, image, is_blocking=False, wait_for=[gate]
     )
-    event = transform.inverse(queue, device, spectrum, wait_for=[cleared])
-    cl.enqueue_copy(queue, result, device.base_data, wait_for=[event])
+    gate.set_status(cl.command_execution_status.COMPLETE)
+    event = transform.forward(unordered, spectrum, device, wait_for=[uploaded])
+    cleared = cl.enqueue_fill_buffer(
+        unordered, device.base_data, np.float32(0), 0, device.nbytes, wait_for=[event]
+    )
+    event = transform.inverse(unordered, device, spectrum, wait_for=[cleared])
+    cl.enqueue_copy(unordered, result, device.base_data, wait_for=[event])
     assert_close(result, image)
 
 

@@ -194,10 +194,7 @@ def test_set_geometry(context, queue):
 
 
 @pytest.mark.parametrize("backend", ["scipy", "reikna"])
-def test_out_of_order_queue(context, backend):
-    queue = cl.CommandQueue(
-        context, properties=cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    )
+def test_out_of_order_queue(context, unordered, backend):
     geometry = scanner()
     first, second = image_of(geometry), image_of(geometry, seed=1)
     ramp_filter = RampFilter(context, geometry, backend=backend)
@@ -205,9 +202,9 @@ def test_out_of_order_queue(context, backend):
     for image, result in zip((first, second), found, strict=True):
         device = cl_array.Array(context, image.shape, np.float32)
         out = cl_array.Array(context, image.shape, np.float32)
-        uploaded = cl.enqueue_copy(queue, device.base_data, image, is_blocking=False)
-        done = ramp_filter(queue, out, device, wait_for=[uploaded])
-        cl.enqueue_copy(queue, result, out.base_data, wait_for=[done])
+        uploaded = cl.enqueue_copy(unordered, device.base_data, image, is_blocking=False)
+        done = ramp_filter(unordered, out, device, wait_for=[uploaded])
+        cl.enqueue_copy(unordered, result, out.base_data, wait_for=[done])
     assert_close(found[0], filtered(geometry, first, np.ones(5)))
     assert_close(found[1], filtered(geometry, second, np.ones(5)))
 

@@ -117,10 +117,9 @@ def test_filter_is_the_formula(context, queue, helix):
     assert np.abs(difference).max() <= RELATIVE * np.abs(expected[:, :, inside]).max()
 
 
-@pytest.mark.parametrize("out_of_order", [False, True])
-def test_chunks_and_offsets_change_nothing(context, out_of_order, monkeypatch):
-    flag = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    queue = cl.CommandQueue(context, properties=flag if out_of_order else 0)
+@pytest.mark.parametrize("kind", ["queue", "unordered"])
+def test_chunks_and_offsets_change_nothing(context, kind, request, monkeypatch):
+    queue = request.getfixturevalue(kind)
     image = image_of(BASE)
     whole = KatsevichFilter(context, BASE, RADIUS)
     shape = (BASE.views - 1, *whole.helix.shape)

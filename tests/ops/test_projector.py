@@ -7,6 +7,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 import pytest
+from geometries import upside_down
 
 from clra import ConeBeamGeometry, Motion, VolumeGrid, circular, helix, space_filling
 from clra.model.phantom import Ellipsoids
@@ -61,16 +62,6 @@ def turned(geometry: ConeBeamGeometry, roll: float, pitch: float) -> ConeBeamGeo
         detector=geometry.detector,
         u=u,
         v=math.cos(b) * v + math.sin(b) * normal,
-        shape=geometry.shape,
-    )
-
-
-def upside_down(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-    return ConeBeamGeometry(
-        source=geometry.source,
-        detector=geometry.detector,
-        u=geometry.u,
-        v=-geometry.v,
         shape=geometry.shape,
     )
 
@@ -465,11 +456,9 @@ def test_arrays_may_begin_within_their_buffers(queue):
     assert np.array_equal(volumes.get(), volume)
 
 
-def test_a_queue_may_be_out_of_order(context, queue):
+def test_a_queue_may_be_out_of_order(context, queue, unordered):
     geometry = GEOMETRIES["helix"]
     volume, projections = numbers(*GRID.shape), numbers(geometry.views, *geometry.shape)
-    mode = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    unordered = cl.CommandQueue(context, properties=mode)
     device = on_device(queue, volume)
     out = cl_array.empty(queue, projections.shape, np.float32)
     one = ForwardProjector(context, geometry, GRID)

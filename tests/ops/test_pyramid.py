@@ -2,6 +2,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 import pytest
+from arrays import with_offset
 
 from clra.ops.pyramid import Prolong3D, Restrict2D, Restrict3D
 
@@ -11,13 +12,6 @@ SHAPES = [(2, 2, 2), (3, 5, 7), (4, 6, 37), (5, 3, 64), (2, 9, 33)]
 
 def values(shape: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
-
-
-def with_offset(queue: cl.CommandQueue, array: np.ndarray, skip: int = 3) -> cl_array.Array:
-    """An array that starts `skip` elements into its buffer and ends before the buffer does."""
-    padded = np.full(array.size + 2 * skip, np.nan, np.float32)
-    padded[skip : skip + array.size] = array.ravel()
-    return cl_array.to_device(queue, padded)[skip : skip + array.size].reshape(array.shape)
 
 
 def half(shape: tuple[int, ...], axes: tuple[int, ...]) -> tuple[int, ...]:
@@ -75,18 +69,15 @@ def test_prolongation_keeps_a_slope_in_place(context, queue):
     np.testing.assert_allclose(out.get()[0, 0, 1:-1], np.arange(1, 39), rtol=1e-6)
 
 
-def test_out_of_order_queue(context):
-    queue = cl.CommandQueue(
-        context, properties=cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    )
+def test_out_of_order_queue(context, unordered):
     volume = values((4, 6, 38))
     fine = cl_array.Array(context, volume.shape, np.float32)
     coarse = cl_array.Array(context, (2, 3, 19), np.float32)
-    uploaded = cl.enqueue_copy(queue, fine.base_data, volume, is_blocking=False)
-    event = Restrict3D(context)(queue, coarse, fine, wait_for=[uploaded])
-    event = Prolong3D(context)(queue, fine, coarse, wait_for=[event])
+    uploaded = cl.enqueue_copy(unordered, fine.base_data, volume, is_blocking=False)
+    event = Restrict3D(context)(unordered, coarse, fine, wait_for=[uploaded])
+    event = Prolong3D(context)(unordered, fine, coarse, wait_for=[event])
     found = np.empty_like(volume)
-    cl.enqueue_copy(queue, found, fine.base_data, wait_for=[event])
+    cl.enqueue_copy(unordered, found, fine.base_data, wait_for=[event])
     expected = prolonged(restricted(volume, (0, 1, 2)), volume.shape)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2 * ROUNDING)
 

@@ -3,19 +3,13 @@
 import numpy as np
 import pyopencl.array as cl_array
 import pytest
+from arrays import with_offset
 
 from clra.ops.transmission import RayStatistics, VolumeStep
 
 SHAPE = (5, 7, 9)  # views, rows, columns
 BACKGROUND = 3.0
 TOLERANCE = 2e-5
-
-
-def with_offset(queue, array, skip=3):
-    """An array that starts some elements into its buffer and ends before the buffer does."""
-    padded = np.full(array.size + 2 * skip, np.nan, np.float32)
-    padded[skip : skip + array.size] = array.ravel()
-    return cl_array.to_device(queue, padded)[skip : skip + array.size].reshape(array.shape)
 
 
 @pytest.fixture(scope="module")

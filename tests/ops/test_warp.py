@@ -111,10 +111,7 @@ def test_a_motion_of_nan_reads_no_foreign_memory(context, queue):
     assert np.all(np.isfinite(found[2]))
 
 
-def test_out_of_order_queue(context):
-    queue = cl.CommandQueue(
-        context, properties=cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    )
+def test_out_of_order_queue(context, unordered):
     motion = np.array([[1.5, -0.5, 1.01]], np.float32)
     operator = Warp(context, (30, 41))
     found = np.empty((2, 1, 30, 41), np.float32)
@@ -123,11 +120,11 @@ def test_out_of_order_queue(context):
         device, out = (cl_array.Array(context, image.shape, np.float32) for _ in range(2))
         moves = cl_array.Array(context, motion.shape, np.float32)
         events = [
-            cl.enqueue_copy(queue, device.base_data, image, is_blocking=False),
-            cl.enqueue_copy(queue, moves.base_data, motion, is_blocking=False),
+            cl.enqueue_copy(unordered, device.base_data, image, is_blocking=False),
+            cl.enqueue_copy(unordered, moves.base_data, motion, is_blocking=False),
         ]
-        done = operator(queue, out, device, moves, wait_for=events)
-        cl.enqueue_copy(queue, result, out.base_data, wait_for=[done])
+        done = operator(unordered, out, device, moves, wait_for=events)
+        cl.enqueue_copy(unordered, result, out.base_data, wait_for=[done])
     for image, result in zip(both, found, strict=True):
         np.testing.assert_allclose(result[0], corrected(image[0], motion[0]), rtol=0, atol=SPLINE)
 
