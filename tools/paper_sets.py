@@ -6,6 +6,7 @@ voxels, in closed form: 3456 radiographs, of 928 x 512 pixels since the paper do
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,3 +86,22 @@ def errors(motion: Motion, truth: Motion, geometry: clra.ConeBeamGeometry) -> di
     names = ("mae_u", "mae_v", "std_u", "std_v", "gauge_free_u", "gauge_free_v")
     row = {name: getattr(error, name) for name in names}
     return row | {"mae_m": float(np.abs(motion.magnification - truth.magnification).mean())}
+
+
+def rest(motion: Motion, truth: Motion, geometry: clra.ConeBeamGeometry) -> dict[str, Any]:
+    """Split an error into movements of the sample and slow and fast motions.
+
+    Root mean squares over the views: of each gauge mode [pixel]; and of what lies beside them, by
+    cycles a scan (below 4, to 40, above), of u, v [pixel] and of the magnification.
+    """
+    error = Motion(
+        shift_u=motion.shift_u - truth.shift_u,
+        shift_v=motion.shift_v - truth.shift_v,
+        magnification=1 + motion.magnification - truth.magnification,
+    )
+    fit = Gauge(geometry, surfaces(), magnification=False).fit(error)
+    power = np.abs(np.fft.fft(fit.remainder, axis=0) / motion.views) ** 2
+    cycles = np.abs(np.fft.fftfreq(motion.views) * motion.views)
+    bands = np.digitize(cycles, [4, 40])
+    found = [np.sqrt(power[bands == band].sum(axis=0)) for band in range(3)]
+    return {"modes": fit.rms_by_mode, "bands": np.array(found).T.tolist()}
