@@ -50,7 +50,7 @@ def correct(
 
 
 def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
-    """Do as :func:`correct`, on the device and within the memory of a stream."""
+    """Do as :func:`correct`, errors included, on the device and within the memory of a stream."""
     if motion.views != scan.views:
         raise ValueError(f"motion: found {motion.views} views, expected {scan.views}")
     return Scan(

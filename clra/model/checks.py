@@ -39,6 +39,25 @@ def positive(name: str, value: Any) -> float:
     return number
 
 
+def panel_shape(shape: Any) -> tuple[int, int]:
+    """Check (rows, columns)."""
+    try:
+        rows, columns = shape
+    except (TypeError, ValueError):
+        raise ValueError(f"shape: found {shape!r}, expected (rows, columns)") from None
+    return whole("shape", rows), whole("shape", columns)
+
+
+def same_views(**columns: Floats) -> None:
+    """Check that all arrays are of as many views as the first."""
+    first, *others = columns
+    views = len(columns[first])
+    for name in others:
+        found = len(columns[name])
+        if found != views:
+            raise ValueError(f"{name}: found {found} views, expected {views} as in {first}")
+
+
 def selection(index: slice | ArrayLike) -> slice | NDArray[Any]:
     """Turn what selects views, a slice, integers or a mask, into an index that keeps the axis."""
     if isinstance(index, slice):

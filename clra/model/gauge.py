@@ -132,6 +132,11 @@ class Gauge:
         -------
         GaugeFit
             Least squares on the columns of `gauge_columns`.
+
+        Raises
+        ------
+        ValueError
+            If the motion is of another number of views.
         """
         if motion.views != self.views:
             raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
@@ -195,6 +200,11 @@ class Gauge:
         ----------
         estimate, truth : Motion
             Of the same views.
+
+        Raises
+        ------
+        ValueError
+            If they are not.
         """
         if estimate.views != truth.views:
             raise ValueError(f"estimate: found {estimate.views} views, expected {truth.views}")
@@ -310,6 +320,11 @@ def without_gauge(
     span : float, optional
         Scale the shifts so that the larger of their two ranges is this [pixel]. One factor serves
         both, else the gauge would come back.
+
+    Raises
+    ------
+    ValueError
+        If the motion is of another number of views.
     """
     if motion.views != geometry.views:
         raise ValueError(f"motion: found {motion.views} views, expected {geometry.views}")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clra.model.checks import selection, vectors, whole
+from clra.model.checks import panel_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
     from clra.model.motion import Motion
@@ -65,11 +65,8 @@ class ConeBeamGeometry:
         object.__setattr__(self, "detector", vectors("detector", detector, "views"))
         object.__setattr__(self, "u", vectors("u", u, "views"))
         object.__setattr__(self, "v", vectors("v", v, "views"))
-        object.__setattr__(self, "shape", _panel_shape(shape))
-        for name in ("detector", "u", "v"):
-            found = len(getattr(self, name))
-            if found != self.views:
-                raise ValueError(f"{name}: found {found} views, expected {self.views} as in source")
+        object.__setattr__(self, "shape", panel_shape(shape))
+        same_views(source=self.source, detector=self.detector, u=self.u, v=self.v)
         self._refuse_degenerate()
 
     def _refuse_degenerate(self) -> None:
@@ -169,6 +166,11 @@ class ConeBeamGeometry:
         ConeBeamGeometry
             With u / m, v / m and detector - (shift_u u + shift_v v) / m; for a motion of the source
             with the source moved by `source_displacement`.
+
+        Raises
+        ------
+        ValueError
+            If the motion is of another number of views.
         """
         if motion.views != self.views:
             raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
@@ -220,6 +222,11 @@ class ConeBeamGeometry:
         ----------
         factor : int
             Rows and columns of a block.
+
+        Raises
+        ------
+        ValueError
+            If it is less than 1 or more than the panel has.
         """
         factor = whole("factor", factor)
         rows, columns = self.rows // factor, self.columns // factor
@@ -275,6 +282,11 @@ class ConeBeamGeometry:
         -------
         ndarray, (views, n, 2)
             (column, row), 0-based; NaN for a point that is not in front of the source.
+
+        Raises
+        ------
+        ValueError
+            If the points are of another shape.
         """
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
@@ -306,21 +318,17 @@ class ConeBeamGeometry:
             Source, detector, u and v of each view [mm].
         shape : (int, int)
             Rows and columns of the panel.
+
+        Raises
+        ------
+        ValueError
+            If the vectors are of another shape, or no geometry.
         """
         numbers = np.asarray(vectors, dtype=np.float64)
         if numbers.ndim != 2 or numbers.shape[1] != 12:
             raise ValueError(f"vectors: found shape {numbers.shape}, expected (views, 12)")
         source, detector, u, v = np.split(numbers, 4, axis=1)
         return cls(source=source, detector=detector, u=u, v=v, shape=shape)
-
-
-def _panel_shape(shape: Any) -> tuple[int, int]:
-    """Check (rows, columns)."""
-    try:
-        rows, columns = shape
-    except (TypeError, ValueError):
-        raise ValueError(f"shape: found {shape!r}, expected (rows, columns)") from None
-    return whole("shape", rows), whole("shape", columns)
 
 
 def _refuse(bad: NDArray[np.bool_], found: str, expected: str) -> None:

@@ -75,7 +75,13 @@ class VolumeGrid:
         return matrix
 
     def slab(self, start: int, stop: int) -> VolumeGrid:
-        """Return the grid of the planes `start` to `stop - 1` along z."""
+        """Return the grid of the planes `start` to `stop - 1` along z.
+
+        Raises
+        ------
+        ValueError
+            If these are not one or more of the grid's planes.
+        """
         nz, ny, nx = self.shape
         if not 0 <= start < stop <= nz:
             raise ValueError(f"slab: found {start}:{stop}, expected 0 <= start < stop <= {nz}")
@@ -85,6 +91,11 @@ class VolumeGrid:
         """Return the grid of voxels `factor` times larger, with the same lower corner.
 
         Voxels at the upper ends that fill no whole block are dropped.
+
+        Raises
+        ------
+        ValueError
+            If `factor` is less than 1 or more than there are voxels along an axis.
         """
         factor = whole("factor", factor)
         if factor > min(self.shape):
@@ -93,7 +104,13 @@ class VolumeGrid:
         return self._moved((nz, ny, nx), self.voxel_size * factor, (0, 0, 0))
 
     def padded(self, planes: int) -> VolumeGrid:
-        """Return the grid with `planes` more planes at each end of z."""
+        """Return the grid with `planes` more planes at each end of z, fewer if negative.
+
+        Raises
+        ------
+        ValueError
+            If no plane is left.
+        """
         nz, ny, nx = self.shape
         if nz + 2 * planes < 1:
             raise ValueError(f"planes: found {planes}, expected more than {-nz / 2:g}")

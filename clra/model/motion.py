@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clra.model.checks import column, selection, whole
+from clra.model.checks import column, same_views, selection, whole
 
 Floats = NDArray[np.float64]
 
@@ -63,12 +63,7 @@ class Motion:
         object.__setattr__(self, "shift_u", column("shift_u", shift_u, "views"))
         object.__setattr__(self, "shift_v", column("shift_v", shift_v, "views"))
         object.__setattr__(self, "magnification", column("magnification", magnification, "views"))
-        for name in ("shift_v", "magnification"):
-            found = len(getattr(self, name))
-            if found != self.views:
-                raise ValueError(
-                    f"{name}: found {found} views, expected {self.views} as in shift_u"
-                )
+        same_views(shift_u=self.shift_u, shift_v=self.shift_v, magnification=self.magnification)
         if self.magnification.min() <= 0:
             raise ValueError(
                 f"magnification: found {self.magnification.min()}, expected positive numbers"
@@ -112,6 +107,11 @@ class Motion:
         residual : Motion
             What is still to be moved once this motion is in the geometry, as a registration of
             measured with re-projected radiographs finds it.
+
+        Raises
+        ------
+        ValueError
+            If it is of another number of views.
         """
         if residual.views != self.views:
             raise ValueError(f"residual: found {residual.views} views, expected {self.views}")

@@ -59,6 +59,11 @@ def circular(
         Rows and columns of the panel.
     start, arc : float
         First angle and angle covered [rad].
+
+    Raises
+    ------
+    ValueError
+        If there is no view, a number is not finite, or a distance not positive.
     """
     views = whole("views", views)
     angles = finite("start", start) + np.arange(views, dtype=np.float64) * (
@@ -90,6 +95,11 @@ def helix(
         Rise from one view to the next; negative downward [mm].
     source_to_axis, source_to_detector, pixel_size, shape, start
         As in `circular`.
+
+    Raises
+    ------
+    ValueError
+        As `circular` does.
     """
     views = whole("views", views)
     angles = finite("start", start) + np.arange(views, dtype=np.float64) * finite(
@@ -128,6 +138,11 @@ def double_helix(
         interleave. "return": the rotation goes on while the travel reverses; view N + k is at the
         height of view N - 1 - k and at the angle ``start + (N + k) angle_step``. The second helix
         has the opposite hand.
+
+    Raises
+    ------
+    ValueError
+        As `circular` does, and for another `second`.
     """
     views = whole("views_per_helix", views_per_helix)
     angles = np.arange(views, dtype=np.float64) * finite("angle_step", angle_step)
@@ -167,6 +182,11 @@ def space_filling(
         As in `helix`.
     angle_step : float, optional
         Angle from one view to the next [rad]; if not given, `lattice_angle`.
+
+    Raises
+    ------
+    ValueError
+        As `circular` does, and for a `z_step` of 0 without an `angle_step`.
     """
     if angle_step is None:
         angle_step = lattice_angle(source_to_axis, z_step)
@@ -199,6 +219,11 @@ def lattice_angle(source_to_axis: float, z_step: float, near: float = _NEAR) -> 
         Rise from one view to the next [mm].
     near : float
         Angle to start from, between 0 and pi [rad].
+
+    Raises
+    ------
+    ValueError
+        If there is no rise, or `near` is not between 0 and pi.
     """
     rise = abs(finite("z_step", z_step)) / positive("source_to_axis", source_to_axis)
     if rise == 0:

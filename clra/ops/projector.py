@@ -95,7 +95,13 @@ class ForwardProjector:
         self._parts = [(a, min(a + thick, planes)) for a in range(0, planes, thick)]
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors for the same views and panel, for example another motion."""
+        """Take other vectors for the same views and panel, for example another motion.
+
+        Raises
+        ------
+        ValueError
+            If views or panel differ, or the grid reaches behind a source.
+        """
         self._layout.set_geometry(geometry)
 
     def __call__(
@@ -230,7 +236,13 @@ class BackProjector:
         self._matched = matched
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors for the same views and panel, for example another motion."""
+        """Take other vectors for the same views and panel, for example another motion.
+
+        Raises
+        ------
+        ValueError
+            If views or panel differ, or the grid reaches behind a source.
+        """
         self._layout.set_geometry(geometry)
 
     def __call__(

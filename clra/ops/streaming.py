@@ -137,6 +137,11 @@ class Stream:
             Of the volume.
         volumes : int
             How many of its kind the device has to hold at a time.
+
+        Raises
+        ------
+        DeviceMemoryError
+            If one plane is larger than that.
         """
         nz, ny, nx = grid.shape
         limit = self.budgets.slab // volumes
