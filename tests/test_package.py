@@ -1,10 +1,13 @@
-"""The package as a whole: its public names, its import, its kernels."""
+"""The package as a whole: its public names, its floors, its import, its kernels."""
 
+import ast
 import importlib.metadata
 import pkgutil
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pyopencl as cl
 import pytest
@@ -56,6 +59,33 @@ sys.exit(f"read {read}" if read else 0)
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+FLOORS = ("kernels", "model", "ops", "methods", "io", "app")
+# A value does not know its file format, but the public face has it saved by a method.
+UPWARDS = {("clra.model.motion", "clra.io.motions")}
+
+
+def imports(path: Path) -> Iterator[list[str]]:
+    """Parts of the names that a module imports, ["clra", "ops", "steps", "Step"] and the like."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}".split(".")
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name.split(".")
+
+
+def test_modules_import_from_their_own_floor_and_below():
+    package = Path(clra.__file__).parent
+    up = set()
+    for number, floor in enumerate(FLOORS):
+        for path in (package / floor).glob("*.py"):
+            for name in imports(path):
+                if name[0] == "clra" and name[1] in FLOORS[number + 1 :]:
+                    up.add((f"clra.{floor}.{path.stem}", ".".join(name[:3])))
+    assert up == UPWARDS
 
 
 def test_no_module_holds_a_device_a_context_or_a_queue(context):
