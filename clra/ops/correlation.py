@@ -12,7 +12,7 @@ from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
 from clra.ops.lines import lanes, lined
 from clra.ops.scratch import Allocator, Scratch
-from clra.ops.steps import Step, to_device
+from clra.ops.steps import Step, group, to_device
 from clra.ops.windows import tukey
 
 # Part of the mean modulus of a pair's cross-power below which a frequency fades out of the phase
@@ -323,17 +323,6 @@ class PhaseCorrelation:
             *(out, images, mean, *self._windows, rows, columns, *size, n),
             wait_for=[event],
         )
-
-
-def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
-    """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
-    size = 1 if opencl.is_cpu(opencl.device_of(context)) else wanted
-    while size > 1:
-        kernel = opencl.builds(context).kernel(file, function, {"GROUP": size})
-        if all(opencl.work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
-            break
-        size //= 2
-    return size
 
 
 def check_pair(

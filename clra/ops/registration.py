@@ -11,10 +11,10 @@ from pyopencl.array import Array
 from clra.ops import opencl
 from clra.ops.bandpass import Bandpass
 from clra.ops.blur import Blur
-from clra.ops.correlation import CoarseShift, check_pair, group
+from clra.ops.correlation import CoarseShift, check_pair
 from clra.ops.lines import lanes, line_stride, lined
 from clra.ops.scratch import Allocator, Scratch, within
-from clra.ops.steps import Step, to_device
+from clra.ops.steps import Step, group, to_device
 from clra.ops.windows import registration_window
 
 ESTIMATE_FIELDS = (

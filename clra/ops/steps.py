@@ -72,3 +72,14 @@ def to_device(context: cl.Context, values: Any, dtype: Any = np.float32) -> Arra
     host = np.ascontiguousarray(values, dtype)
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     return Array(context, host.shape, host.dtype, data=cl.Buffer(context, flags, hostbuf=host))
+
+
+def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
+    """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
+    size = 1 if opencl.is_cpu(opencl.device_of(context)) else wanted
+    while size > 1:
+        kernel = opencl.builds(context).kernel(file, function, {"GROUP": size})
+        if all(opencl.work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
+            break
+        size //= 2
+    return size
