@@ -38,6 +38,7 @@ QUICK = (
     "tests/kernels",
     "tests/test_package.py",
     "tests/ops/test_projector.py",
+    "tests/ops/test_projector_calls.py",
     "tests/ops/test_registration.py",
     "tests/ops/test_filtering.py",
     "tests/ops/test_pibackproject.py",
