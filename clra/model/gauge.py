@@ -219,7 +219,6 @@ class Gauge:
             *raw.mean(axis=0).tolist(),
             *raw.std(axis=0).tolist(),
             *free.mean(axis=0).tolist(),
-            *free.std(axis=0).tolist(),
         )
 
 
@@ -269,8 +268,6 @@ class MotionError:
         Standard deviation of the absolute error: the error bars of the paper's figure 3.
     gauge_free_u, gauge_free_v, gauge_free_m : float
         Mean absolute error without what the gauge explains.
-    gauge_free_std_u, gauge_free_std_v, gauge_free_std_m : float
-        Its standard deviation.
     """
 
     mae_u: float
@@ -282,9 +279,6 @@ class MotionError:
     gauge_free_u: float
     gauge_free_v: float
     gauge_free_m: float
-    gauge_free_std_u: float
-    gauge_free_std_v: float
-    gauge_free_std_m: float
 
     def means(self) -> dict[str, float]:
         """Return the mean absolute errors alone, by name."""

@@ -194,8 +194,7 @@ def test_error_is_raw_and_gauge_free(scan, points):
     assert error.mae_v == pytest.approx(np.abs(gauge.shift_v).mean())
     assert error.mae_m == pytest.approx(np.abs(gauge.magnification - 1).mean())
     assert error.std_u == pytest.approx(np.abs(gauge.shift_u).std())
-    for name in ("u", "v", "m", "std_u", "std_v", "std_m"):
-        assert getattr(error, f"gauge_free_{name}") < ROUNDING
+    assert max(error.gauge_free_u, error.gauge_free_v, error.gauge_free_m) < ROUNDING
     with pytest.raises(ValueError, match="estimate: found 96 views, expected 97"):
         Gauge(scan, points).error(estimate.subset(slice(96)), truth)
 
