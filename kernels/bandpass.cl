@@ -195,7 +195,7 @@ kernel void narrow_rows(
     floatn sum = 0.0f;
     for (int k = -min(radius, j); k <= min(radius, rows - 1 - j); ++k) {
         global const float *from = image + (long)k * columns;
-        floatn value = columns - i >= LANES ? load_unaligned(from) : load_some(from, columns - i);
+        floatn value = load_columns(from, columns - i);
         if (masked)
             value = select((floatn)0.0f, value, load_unaligned(mask + (long)k * stride) > 0.0f);
         sum += taps[k + radius] * value;
@@ -284,8 +284,5 @@ kernel void spline_values(
     }
     const floatn value = (2.0f / 3.0f) * middle + (1.0f / 6.0f) * side;
     values += ((ulong)view * rows + j) * values_stride + values_lead + i;
-    if (columns - i >= LANES)
-        store_unaligned(value, values);
-    else
-        store_some(value, values, columns - i);
+    store_columns(value, values, columns - i);
 }

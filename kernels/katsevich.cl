@@ -8,20 +8,6 @@
 
 #include "unaligned.clh"
 
-// `count` <= LANES columns at p
-static inline floatn load_columns(global const float *p, const int count)
-{
-    return count < LANES ? load_some(p, count) : load_unaligned(p);
-}
-
-static inline void store_columns(const floatn v, global float *p, const int count)
-{
-    if (count < LANES)
-        store_some(v, p, count);
-    else
-        store_unaligned(v, p);
-}
-
 // Linear interpolation across lines, `stride` apart, at a position of its own for each column.
 // Positions of neighbouring columns are near each other: all lines among them are read whole.
 static inline floatn across_lines(

@@ -41,18 +41,6 @@ static inline int position(
     return i + (int)whole;
 }
 
-static inline void store_first(const floatn v, global float *p, const int count)
-{
-    if (count >= LANES) {
-        store_unaligned(v, p);
-        return;
-    }
-    float some[LANES];
-    store_lanes(v, some);
-    for (int k = 0; k < count; ++k)
-        p[k] = some[k];
-}
-
 kernel void prefilter_rows(
     global float *restrict coefficients, // (views, rows, columns)
     const ulong coefficients_offset,
@@ -166,7 +154,7 @@ kernel void prefilter_columns(
     floatn sum = taps[0] * load_unaligned(image);
     for (int k = 1; k <= TAPS; ++k)
         sum += taps[k] * (load_unaligned(image - k) + load_unaligned(image + k));
-    store_first(sum, coefficients + ((ulong)view * rows + j) * columns + i, columns - i);
+    store_columns(sum, coefficients + ((ulong)view * rows + j) * columns + i, columns - i);
 }
 
 kernel void resample_columns(
