@@ -184,9 +184,8 @@ class Bandpass:
             If an array is none of the above.
         """
         opencl.check_queue(queue, self._context)
-        n = len(images) if getattr(images, "ndim", 0) == 3 else 0
-        opencl.check_array("images", images, (n, *self.shape), context=self._context)
-        if not 1 <= n <= self._views:
+        n = opencl.check_images("images", images, self.shape, self._context)
+        if n > self._views:
             raise ValueError(f"images: found {n} of them, expected 1 to {self._views}")
         opencl.check_array("out", out, (n, *self.shape), context=self._context)
         if self._own is None:

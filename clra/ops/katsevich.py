@@ -147,14 +147,8 @@ class KatsevichFilter:
             If an argument is none of the above.
         """
         opencl.check_queue(queue, self._context)
-        shape = getattr(projections, "shape", (0,))
-        views = shape[0] - 1 if shape else 0
-        if views < 1:
-            raise ValueError(f"projections: found shape {shape}, expected two views at least")
-        rows, columns = self._measured.shape
-        opencl.check_array(
-            "projections", projections, (views + 1, rows, columns), context=self._context
-        )
+        measured = self._measured.shape
+        views = opencl.check_images("projections", projections, measured, self._context, 2) - 1
         opencl.check_array(
             "filtered_out", filtered_out, (views, *self.helix.shape), context=self._context
         )

@@ -220,9 +220,8 @@ class Residual:
             If an array is none of the above.
         """
         opencl.check_queue(queue, self._context)
-        n = getattr(measured, "shape", (0,))[0]
-        images = {"residual_out": residual_out, "measured": measured, "simulated": simulated}
-        for name, array in images.items():
+        n = opencl.check_images("measured", measured, self._used.shape, self._context)
+        for name, array in (("residual_out", residual_out), ("simulated", simulated)):
             opencl.check_array(name, array, (n, *self._used.shape), context=self._context)
         opencl.check_array("motion", motion, (n, 3), context=self._context)
         rows, columns = self._used.shape

@@ -160,6 +160,38 @@ def check_array(
         raise ValueError(f"{name}: its context {array.context} is not the operator's {context}")
 
 
+def check_images(
+    name: str, array: Any, shape: tuple[int, ...], context: cl.Context, least: int = 1
+) -> int:
+    """Return how many images there are in an array; refuse what holds none of that shape.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, for the message.
+    array : cl.array.Array
+        To be checked: float32 (n, rows, columns).
+    shape : tuple of int
+        Expected rows and columns.
+    context : cl.Context
+        Context that the array has to belong to.
+    least : int
+        Least number of images.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`check_array` does, and for fewer images.
+    """
+    check_array(name, array, getattr(array, "shape", ()), context=context)
+    if array.shape[1:] != tuple(shape) or array.ndim == 0 or len(array) < least:
+        expected = ", ".join(["n", *map(str, shape)])
+        raise ValueError(
+            f"{name}: found shape {array.shape}, expected ({expected}) with n at least {least}"
+        )
+    return len(array)
+
+
 def check_queue(queue: cl.CommandQueue, context: cl.Context) -> None:
     """Refuse a queue of another context than an operator's, with a ValueError."""
     if queue.context != context:

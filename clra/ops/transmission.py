@@ -202,11 +202,11 @@ class RayStatistics:
     def _check(self, queue: cl.CommandQueue, **arrays: Array) -> int:
         """Refuse what does not fit; number of views."""
         opencl.check_queue(queue, self._context)
-        views = {getattr(array, "shape", (0,))[0] for array in arrays.values()}
+        measured = arrays.pop("measured")
+        n = opencl.check_images("measured", measured, self._shape, self._context)
         for name, array in arrays.items():
-            shape = (max(views), *self._shape)
-            opencl.check_array(name, array, shape, context=self._context)
-        return int(max(views))
+            opencl.check_array(name, array, (n, *self._shape), context=self._context)
+        return n
 
 
 class VolumeStep:

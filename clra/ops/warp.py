@@ -126,8 +126,7 @@ class Warp:
             If an array is none of the above.
         """
         opencl.check_queue(queue, self._context)
-        n = max(1, (getattr(measured, "shape", None) or (1,))[0])
-        opencl.check_array("measured", measured, (n, *self.shape), context=self._context)
+        n = opencl.check_images("measured", measured, self.shape, self._context)
         opencl.check_array("corrected_out", corrected_out, (n, *self.shape), context=self._context)
         opencl.check_array("motion", motion, (n, 3), context=self._context)
         chunk = min(n, self._most_views)

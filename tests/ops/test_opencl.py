@@ -73,6 +73,22 @@ def test_check_array_names_both_sides(context, queue):
         opencl.check_array("x", good, (3, 4), context=cl.Context(context.devices))
 
 
+def test_images_are_counted_if_there_are_any_of_that_shape(context, queue):
+    assert (
+        opencl.check_images("x", cl.array.zeros(queue, (3, 4, 5), np.float32), (4, 5), context) == 3
+    )
+    for shape in ((3, 5, 4), (4, 5), (1, 3, 4, 5), ()):
+        with pytest.raises(
+            ValueError, match=r"x: found shape \(.*, expected \(n, 4, 5\) with n at"
+        ):
+            opencl.check_images("x", cl.array.zeros(queue, shape, np.float32), (4, 5), context)
+    with pytest.raises(ValueError, match="with n at least 2"):
+        one = cl.array.zeros(queue, (1, 4, 5), np.float32)
+        opencl.check_images("x", one, (4, 5), context, least=2)
+    with pytest.raises(TypeError, match="x: found float, expected"):
+        opencl.check_images("x", 1.0, (4, 5), context)
+
+
 def test_offset_is_counted_in_elements(queue):
     whole = cl.array.zeros(queue, 10, np.float32)
     buffer, offset = opencl.buffer_argument(whole[3:])
