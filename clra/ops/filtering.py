@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
+from clra.ops.lines import lanes
 from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
 from clra.ops.views import check_geometry, successive
@@ -135,7 +136,7 @@ class RampFilter:
         margin = math.ceil(_EXTENSION * self._columns) if extend else 0
         self.padded = fast_length(context, 2 * (self._columns + margin), backend)
         cpu = opencl.is_cpu(opencl.device_of(context))
-        self._lanes = 8 if cpu else 2
+        self._lanes = lanes(context)
         most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)
         lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
         memory = Scratch(context, allocator)

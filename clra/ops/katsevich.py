@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from clra.model.helix import Helix
 from clra.ops import opencl
 from clra.ops.fft import RealFFT, fast_length
+from clra.ops.lines import lanes
 from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
 
@@ -97,7 +98,7 @@ class KatsevichFilter:
         self.padded = fast_length(context, 2 * columns, backend)
         self._hilbert = to_device(context, _spectrum(helix, self.padded), np.complex64)
         cpu = opencl.is_cpu(opencl.device_of(context))
-        self._lanes = 8 if cpu else 2
+        self._lanes = lanes(context)
         self._stride = 8 * -(-columns // 8)
         self._lines_of_rows = to_device(context, _line_positions(helix, psi, window, self._stride))
         most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)

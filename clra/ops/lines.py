@@ -1,4 +1,4 @@
-"""Lined images, whose lines may be read past their ends: see ``kernels/lanes.clh``."""
+"""Vectors of columns, and lined images, whose lines may be read past their ends: see lanes.clh."""
 
 import numpy as np
 import pyopencl as cl

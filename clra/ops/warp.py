@@ -8,12 +8,11 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.ops import opencl
+from clra.ops.lines import lanes, line_stride
 from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
 
-# As in warp.cl and lanes.clh.
-_TAPS = 14
-_MARGIN = 16
+_TAPS = 14  # as in warp.cl
 
 # Bytes of images in work at a time, in each of two buffers: a CPU wants them in its cache between
 # the steps (1 to 64 MiB differ by 20 % on two cores), a GPU wants enough of them to fill it.
@@ -71,9 +70,9 @@ class Warp:
         self.shape = shape
         self._context = context
         cpu = opencl.is_cpu(opencl.device_of(context))
-        self._lanes = 8 if cpu else 2
+        self._lanes = lanes(context)
         rows, columns = shape
-        self._stride = 2 * _MARGIN + 16 * -(-columns // 16)
+        self._stride = line_stride(columns)
         # Of two images each; as many bytes are best for one.
         limit = None if scratch_limit is None else scratch_limit // 2
         most = within(_CPU_BYTES if cpu else _GPU_BYTES, limit)
