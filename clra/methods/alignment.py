@@ -78,7 +78,7 @@ def align(
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
+        As :func:`clra.ops.devices.choose_device` takes it.
     reference : Scan, optional
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.

@@ -87,7 +87,7 @@ def autofocus(
         Any trajectory of at least a whole turn; it may have moved: blur changes little in where
         slices are sharpest.
     device : str or cl.Device, optional
-        As :func:`clra.ops.opencl.choose_device` takes it.
+        As :func:`clra.ops.devices.choose_device` takes it.
     motion : Motion, optional
         Known so far.
     progress : callable, optional
