@@ -1,7 +1,7 @@
 // Views that see a voxel, W, on a coarse grid; and a volume divided by it.
 //
-// W(x) = sum over views of the weight of the row that x falls on, linear between rows, 0 for a view
-// on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It varies over many
+// W(x) = sum over views of the view's weight times that of the row that x falls on, linear between
+// rows, 0 for a view on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It varies over many
 // voxels, so that it is computed once for a block of them and interpolated linearly.
 //
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
@@ -12,6 +12,8 @@ kernel void coverage(
     const ulong seen_offset,
     global const float *restrict matrices, // (views, 12), from coarse (i, j, k, 1) to (a, b, g)
     const ulong matrices_offset,
+    global const float *restrict view_weight, // (views)
+    const ulong view_weight_offset,
     global const float *restrict row_weight, // (rows)
     const ulong row_weight_offset,
     const int nx, // coarse voxels
@@ -23,6 +25,7 @@ kernel void coverage(
 {
     seen += seen_offset;
     matrices += matrices_offset;
+    view_weight += view_weight_offset;
     row_weight += row_weight_offset;
     const int k = get_global_id(0), i = get_global_id(1), j = get_global_id(2);
     if (k >= nz || i >= nx || j >= ny)
@@ -40,7 +43,7 @@ kernel void coverage(
         const int r = on ? min((int)row, rows - 2) : 0;
         const float f = row - r;
         const float weight = row_weight[r] + f * (row_weight[r + 1] - row_weight[r]);
-        sum += on ? weight : 0.0f;
+        sum += on ? view_weight[view] * weight : 0.0f;
     }
     seen[((size_t)j * nx + i) * nz + k] = sum;
 }

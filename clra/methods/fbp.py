@@ -7,6 +7,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clra.methods.outliers import handed_on
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.visibility import runs, views_that_see
@@ -47,7 +48,8 @@ def ramp_fbp(
     grid : VolumeGrid
         Where to reconstruct.
     believed : ndarray of bool, (views,), optional
-        Views to reconstruct from, at least one; all by default.
+        Views to reconstruct from, at least one; all by default. The weight of the others goes to
+        those beside them, see :func:`clra.methods.outliers.handed_on`.
     stage : str
         What progress reports call this.
     volumes : int
@@ -72,8 +74,9 @@ def ramp_fbp(
     context, queue = stream.context, stream.queue
     row_weight = taper(geometry.rows, FADE)
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
-    ramp = RampFilter(context, geometry, row_weight=row_weight, **memory)
     chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
+    weight = handed_on(geometry.source, chosen)
+    ramp = RampFilter(context, geometry, row_weight=row_weight, view_weight=weight, **memory)
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])
     coverage = Coverage(
@@ -81,6 +84,7 @@ def ramp_fbp(
         geometry.subset(chosen),
         grid.slab(near.start, near.stop),
         row_weight,
+        view_weight=weight[chosen],
         circle=circle,
         allocator=stream.memory,
     )

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
+from scipy.spatial import KDTree
 
 from clra.model.motion import Motion
 from clra.ops.streaming import Radiographs, Stream
@@ -20,6 +21,11 @@ _DEVIATIONS, _LEAST, _LACK = 5.0, 0.1, 10.0
 _ODD = 0.3
 # Neighbours in time that the ends of a scan, which look past the sample, are compared with.
 _NEIGHBOURS = 9
+# Views that take over the weight of one that is left out: those around it on a space-filling
+# lattice, where 4 leave the worst of six choices 10 % more error in u than no gap would, 6 leave
+# 5 %, 10 no less; on a helix nearly all goes to the two beside it. And the most that each takes: a
+# long gap stays a gap rather than become streaks of the views beside it.
+_HEIRS, _MOST = 6, 1.0
 
 
 def odd_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
@@ -74,6 +80,37 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
     spread = 1.4826 * np.median(np.abs(correlation - middle))
     least = min(_LEAST, _LACK * (1 - middle))
     return np.asarray(correlation < middle - max(_DEVIATIONS * spread, least))
+
+
+def handed_on(source: Floats, believed: NDArray[np.bool_]) -> Floats:
+    """Hand the weight of views that are left out of a reconstruction on to those beside them.
+
+    Without that a gap in the directions draws the volume, and with it the motions of all others
+    that are registered with it, aside.
+
+    Parameters
+    ----------
+    source : ndarray, (views, 3)
+        Positions of the source [mm]; views beside each other look from nearly the same.
+    believed : ndarray of bool, (views,)
+        Views to reconstruct from, at least one.
+
+    Returns
+    -------
+    ndarray, (views,)
+        Weights: 0 for views left out, 1 to 2 for the others, by the inverse squared distance.
+    """
+    weights = believed.astype(np.float64)
+    heirs = np.flatnonzero(believed)
+    if len(heirs) == len(believed):
+        return weights
+    count = min(_HEIRS, len(heirs))
+    distance, nearest = KDTree(source[heirs]).query(source[~believed], k=range(1, count + 1))
+    near = 1 / np.maximum(distance, np.finfo(np.float32).eps * np.abs(source).max()) ** 2
+    taken = np.zeros(len(heirs))
+    np.add.at(taken, nearest, near / near.sum(axis=1, keepdims=True))
+    weights[heirs] += np.minimum(taken, _MOST)
+    return weights
 
 
 def from_neighbours(motion: Motion, weak: NDArray[np.bool_]) -> Motion:

@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops import opencl
+from clra.ops.filtering import view_weights
 from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 from clra.ops.views import check_geometry
@@ -35,7 +36,7 @@ def around(planes: slice, of: int) -> slice:
 
 
 class Coverage:
-    """W(x): the sum, over the views that see x, of the weight of the row that x falls on.
+    """W(x): the sum, over the views that see x, of their weight and that of the row x falls on.
 
     Parameters
     ----------
@@ -47,6 +48,8 @@ class Coverage:
         Of the volume.
     row_weight : array_like, (rows,)
         By which the rows of each projection were multiplied.
+    view_weight : array_like, (views,), optional
+        By which each projection was multiplied as a whole; 1 by default.
     circle : bool
         Whether volumes are set to zero outside the circle that all views see.
     allocator : callable, optional
@@ -60,7 +63,7 @@ class Coverage:
     Raises
     ------
     ValueError
-        If there is not a weight for each row.
+        If there is not a weight for each row and view.
     """
 
     def __init__(
@@ -70,12 +73,14 @@ class Coverage:
         grid: VolumeGrid,
         row_weight: ArrayLike,
         *,
+        view_weight: ArrayLike | None = None,
         circle: bool = True,
         allocator: Allocator | None = None,
     ) -> None:
         weights = np.asarray(row_weight, np.float64)
         if weights.shape != (geometry.rows,):
             raise ValueError(f"row_weight: found {weights.shape}, expected ({geometry.rows},)")
+        self._view_weight = view_weights(view_weight, geometry.views)
         self._context = context
         self._grid = grid
         self._counted = (geometry.views, geometry.rows, geometry.columns)
@@ -85,6 +90,7 @@ class Coverage:
         self._coarse = (-(-nx // _ACROSS), -(-ny // _ACROSS), -(-nz // _ALONG))
         self._row_weight, self._circle = weights, circle
         self._weights = to_device(context, np.resize(weights, self._panel[1]))
+        self._weights_of_views = to_device(context, self._view_weight)
         self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
         self.scratch_bytes = self._seen.nbytes
         self._count = Step(context, "coverage.cl", "coverage", (16, 1, 1))
@@ -102,7 +108,7 @@ class Coverage:
         """
         check_geometry(geometry, self._counted)
         self._matrices = to_device(self._context, self._coarse_matrices(geometry))
-        self._least = _LEAST * _most_views(geometry, self._row_weight)
+        self._least = _LEAST * _most_views(geometry, self._row_weight, self._view_weight)
         radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
         self._radius = radius / self._grid.voxel_size if self._circle else math.inf
 
@@ -137,6 +143,7 @@ class Coverage:
             (nz, nx, ny),
             self._seen,
             self._matrices,
+            self._weights_of_views,
             self._weights,
             *self._coarse,
             *self._panel,
@@ -220,7 +227,9 @@ class Coverage:
         return event
 
 
-def _most_views(geometry: ConeBeamGeometry, row_weight: np.ndarray) -> float:
+def _most_views(
+    geometry: ConeBeamGeometry, row_weight: np.ndarray, view_weight: np.ndarray
+) -> float:
     """W where it is largest on the axis."""
     low, high = geometry.source[:, 2].min(), geometry.source[:, 2].max()
     heights = np.linspace(low, high, _HEIGHTS if high > low else 1)
@@ -228,4 +237,4 @@ def _most_views(geometry: ConeBeamGeometry, row_weight: np.ndarray) -> float:
     row = geometry.project(axis)[..., 1]
     on = (row >= 0) & (row <= geometry.rows - 1)
     weight = np.interp(row, np.arange(geometry.rows), row_weight)
-    return float(np.sum(np.where(on, weight, 0.0), axis=0).max())
+    return float((view_weight @ np.where(on, weight, 0.0)).max())

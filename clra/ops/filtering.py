@@ -70,7 +70,7 @@ class RampFilter:
     """Cosine weight, ramp filter along u, and the scale that back-projection needs.
 
     Of radiographs p of line integrals it makes ``q = SOD / (SDD |u|) (p w r) * h`` with w the
-    distance from source to panel over the length of the ray, r the row weights and h the
+    distance from source to panel over the length of the ray, r the row and view weights, and h the
     band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd n, 0 for even n. With
     depth fractions g(x) and summed row weights W(x) the attenuation is then
     ``f(x) = pi / W(x) sum_i q_i(x) / g_i(x)^2`` for views around the whole circle. [1]_
@@ -83,6 +83,8 @@ class RampFilter:
         Of all views.
     row_weight : array_like, optional
         (rows,) weights of the detector's rows, see :func:`taper`; 1 by default.
+    view_weight : array_like, optional
+        (views,) weights of the radiographs as a whole; 1 by default.
     window : {"ram-lak", "shepp-logan", "hann"}
         What the ramp's spectrum is multiplied by: nothing, a sinc, or a raised cosine that is 0 at
         the Nyquist frequency.
@@ -122,6 +124,7 @@ class RampFilter:
         geometry: ConeBeamGeometry,
         *,
         row_weight: ArrayLike | None = None,
+        view_weight: ArrayLike | None = None,
         window: str = "ram-lak",
         extend: bool = False,
         backend: str | None = None,
@@ -147,6 +150,7 @@ class RampFilter:
         self._weight = Step(context, "filtering.cl", "weight_lines", (64, 2), defines)
         self._cut = Step(context, "filtering.cl", "cut_lines", (64, 2), defines)
         self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
+        self._view_weight = view_weights(view_weight, self._views)
         self._roll = to_device(context, _roll(self.padded - self._columns, margin))
         self._ramp = to_device(context, _ramp_spectrum(self.padded, window))
         self._last: list[cl.Event] = []
@@ -161,7 +165,7 @@ class RampFilter:
             If views or shape differ.
         """
         check_geometry(geometry, (self._views, self._rows, self._columns))
-        self._view_table = to_device(self._context, _view_table(geometry))
+        self._view_table = to_device(self._context, _view_table(geometry, self._view_weight))
 
     def __call__(
         self,
@@ -246,7 +250,17 @@ def _row_weights(row_weight: ArrayLike | None, rows: int) -> NDArray[np.float32]
     return weights
 
 
-def _view_table(geometry: ConeBeamGeometry) -> NDArray[np.float32]:
+def view_weights(view_weight: ArrayLike | None, views: int) -> NDArray[np.float64]:
+    """Return weights of views as given, (views,); 1 by default."""
+    weights = np.ones(views) if view_weight is None else np.asarray(view_weight, np.float64)
+    if weights.shape != (views,) or not np.all(np.isfinite(weights)):
+        raise ValueError(f"view_weight: found {weights.shape}, expected {views} finite numbers")
+    return weights
+
+
+def _view_table(
+    geometry: ConeBeamGeometry, view_weight: NDArray[np.float64]
+) -> NDArray[np.float32]:
     """Make the table (views, 6) that filtering.cl reads."""
     distance = geometry.source_to_detector
     u, v = geometry.u / distance[:, None], geometry.v / distance[:, None]
@@ -257,7 +271,7 @@ def _view_table(geometry: ConeBeamGeometry) -> NDArray[np.float32]:
         np.sum(u * u, axis=1),
         np.sum(v * v, axis=1),
         2 * np.sum(u * v, axis=1),
-        geometry.source_to_axis / (distance * pitch),
+        view_weight * geometry.source_to_axis / (distance * pitch),
     ]
     return np.stack(columns, axis=1).astype(np.float32)
 

@@ -1,9 +1,10 @@
 """Views that are not believed, and what they are given instead."""
 
 import numpy as np
+import pytest
 
 import clra
-from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
+from clra.methods.outliers import from_neighbours, handed_on, odd_radiographs, outliers
 from clra.ops.streaming import Radiographs, Stream
 
 
@@ -50,6 +51,43 @@ def test_ends_of_a_scan_that_look_past_the_sample_are_not_odd():
     fading = np.clip(np.minimum(np.arange(80), np.arange(80)[::-1]) / 8, 0.05, 1.0)
     rows = np.random.default_rng(2).normal(1.0, 0.3, (80, 17, 19)) * fading[:, None, None]
     assert _odd(rows.astype(np.float32)) == []
+
+
+def _around(views):
+    angle = 2 * np.pi * np.arange(views) / views
+    return np.stack([5 * np.sin(angle), -5 * np.cos(angle), 0 * angle], axis=1)
+
+
+def test_the_weight_of_a_view_left_out_goes_to_those_beside_it():
+    believed = np.arange(72) != 0
+    weights = handed_on(_around(72), believed)
+    assert weights.sum() == pytest.approx(72)
+    # By the inverse squared distance, 1 : 2 : 3 but for a little: the sources stand on a circle.
+    shares = np.array([1, 1 / 4, 1 / 9]) / (2 * (1 + 1 / 4 + 1 / 9))
+    assert weights[1:4] == pytest.approx(1 + shares, rel=1e-3)
+    assert weights[:-4:-1] == pytest.approx(1 + shares, rel=1e-3)
+    assert (weights[4:69] == 1).all() and weights[0] == 0
+
+
+def test_beside_means_where_the_source_was_and_not_when():
+    order = np.random.default_rng(0).permutation(72)
+    believed = np.arange(72) != 0
+    weights = handed_on(_around(72)[order], believed[order])
+    assert np.allclose(weights, handed_on(_around(72), believed)[order], rtol=1e-12)
+
+
+def test_a_long_gap_stays_a_gap():
+    believed = np.arange(72) >= 20
+    weights = handed_on(_around(72), believed)
+    # The six nearest at either end at most double.
+    assert weights.max() == 2 and 52 < weights.sum() <= 64
+
+
+def test_weights_without_a_choice():
+    assert (handed_on(_around(9), np.ones(9, np.bool_)) == 1).all()
+    assert handed_on(_around(9), np.arange(9) == 4).tolist() == [0, 0, 0, 0, 2, 0, 0, 0, 0]
+    # Views from one and the same place.
+    assert handed_on(np.ones((4, 3)), np.arange(4) > 0)[1:].tolist() == pytest.approx([4 / 3] * 3)
 
 
 def test_weak_views_get_what_lies_between_their_neighbours():

@@ -25,8 +25,10 @@ def _counted(geometry, grid, row_weight):
     return np.where(on, weight, 0.0).sum(axis=0).reshape(grid.shape)
 
 
-def _normalised(context, queue, geometry, grid, row_weight, order="zyx", first=0, planes=None):
-    coverage = Coverage(context, geometry, grid, row_weight)
+def _normalised(
+    context, queue, geometry, grid, row_weight, order="zyx", first=0, planes=None, **more
+):
+    coverage = Coverage(context, geometry, grid, row_weight, **more)
     coverage.compute(queue)
     nz, ny, nx = grid.shape
     nz = planes or nz
@@ -51,6 +53,17 @@ def test_views_are_counted(context, queue, order):
     assert inside.mean() > 0.6
     error = np.abs(1 / inverse[inside] - expected[inside])
     assert error.max() < TOLERANCE * expected.max()
+
+
+def test_views_count_by_their_weight(context, queue):
+    geometry = clra.helix(50, angle_step=math.radians(23), z_step=0.3, **PANEL)
+    grid = VolumeGrid(shape=(19, 10, 11), voxel_size=1.1)
+    weight = np.random.default_rng(0).integers(0, 3, geometry.views)
+    twice = np.repeat(np.arange(geometry.views), weight)  # as often as it weighs
+    rows = _smooth_weight(geometry.rows)
+    volume = _normalised(context, queue, geometry, grid, rows, view_weight=weight)
+    expected = _normalised(context, queue, geometry.subset(twice), grid, rows)
+    assert np.allclose(volume[expected > 0], expected[expected > 0], rtol=1e-5)
 
 
 def test_a_slab_is_part_of_the_whole(context, queue):
@@ -97,6 +110,17 @@ def test_weights_must_fit_the_panel(context):
             clra.circular(5, **PANEL),
             VolumeGrid(shape=(2, 2, 2), voxel_size=1.0),
             np.ones(7),
+        )
+
+
+def test_weights_must_fit_the_views(context):
+    with pytest.raises(ValueError, match=r"view_weight: found \(7,\), expected 5 finite numbers"):
+        Coverage(
+            context,
+            clra.circular(5, **PANEL),
+            VolumeGrid(shape=(2, 2, 2), voxel_size=1.0),
+            np.ones(38),
+            view_weight=np.ones(7),
         )
 
 

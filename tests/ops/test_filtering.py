@@ -92,8 +92,11 @@ def assert_close(found: np.ndarray, expected: np.ndarray, relative: float = RELA
 def test_filter_is_the_direct_convolution(context, queue, shape):
     geometry = scanner(shape=shape)
     image, row_weight = image_of(geometry), np.linspace(0.5, 1, shape[0])
-    found = run(context, queue, geometry, image, row_weight=row_weight)
-    assert_close(found, filtered(geometry, image, row_weight))
+    view_weight = np.array([1.0, 1.75, 0.5])
+    options = {"row_weight": row_weight, "view_weight": view_weight}
+    found = run(context, queue, geometry, image, **options)
+    weighted = view_weight[:, None, None] * image
+    assert_close(found, filtered(geometry, weighted, row_weight))
 
 
 @pytest.mark.parametrize("window", filtering.WINDOWS)
@@ -225,6 +228,8 @@ def test_what_is_refused(context, queue):
         RampFilter(context, geometry, window="box")
     with pytest.raises(ValueError, match="row_weight: found"):
         RampFilter(context, geometry, row_weight=np.ones(4))
+    with pytest.raises(ValueError, match="view_weight: found"):
+        RampFilter(context, geometry, view_weight=np.ones(4))
 
 
 @pytest.mark.parametrize("rows", [1, 10, 11])
