@@ -57,7 +57,7 @@ def test_slabs_and_chunks_change_nothing():
     assert np.abs(volume.to_host() - whole).max() < 1e-5 * np.abs(whole).max()
 
 
-# Of what merely leaving views out changes in the volume, blurred by a voxel: on a helix those beside
+# Of what merely leaving views out changes in a volume blurred by a voxel: on a helix those beside
 # look from 4 degrees aside, on the other from 12 and more.
 @pytest.mark.parametrize(("trajectory", "part"), [("helix", 0.3), ("space-filling", 0.65)])
 def test_views_that_are_not_believed_are_left_out_and_stood_in_for(trajectory, part):
