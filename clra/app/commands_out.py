@@ -113,6 +113,7 @@ def align(
     about = {
         "file": str(scan.absolute()),
         "estimate": estimate,
+        "unobservable": "taken out" if gauge == "anchored" and method != "reference" else "left in",
         "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
         f"--estimate {estimate} --gauge {gauge}"
         f"{'' if reference is None else f' --reference {reference}'}"
@@ -195,7 +196,7 @@ def correct(
 
     limits = memory.limits()
     opened = reading.scan(scan)
-    opened, known = motion_for(opened, motion)
+    opened, known, _ = motion_for(opened, motion)
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns)
     with console.progress() as progress:

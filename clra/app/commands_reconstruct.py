@@ -9,6 +9,9 @@ import typer
 from clra.app.console import Console, Memory, Reading
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from clra.methods.multigrid import Step
     from clra.model.grid import VolumeGrid
     from clra.model.motion import Motion
@@ -122,9 +125,9 @@ def reconstruct(
     if options.get("initial") not in (None, "fbp", "uniform"):
         options["initial"] = _start(Path(options["initial"]), grid)
     sorted_options(method, options)
-    known = None
+    known = believed = None
     if motion is not None:
-        opened, known = motion_for(opened, motion)
+        opened, known, believed = motion_for(opened, motion)
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx)
     steps: tuple[Step, ...] = ()
@@ -135,6 +138,7 @@ def reconstruct(
                 out,
                 grid,
                 known,
+                believed,
                 align,
                 options,
                 iterating.resume,
@@ -151,6 +155,7 @@ def reconstruct(
                     grid=grid,
                     motion=known,
                     align=align,
+                    believed=believed,
                     device=console.device,
                     progress=progress,
                     **limits,
@@ -180,6 +185,7 @@ def _imgr(
     out: Path,
     grid: "VolumeGrid",
     motion: "Motion | None",
+    believed: "NDArray[np.bool_] | None",
     align: bool,
     options: dict[str, Any],
     resume: bool,
@@ -209,6 +215,7 @@ def _imgr(
             grid,
             align=align,
             motion=motion,
+            believed=believed,
             truth=scan.truth,
             osem=osem,
             progressed=progressed,

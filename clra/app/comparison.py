@@ -96,6 +96,7 @@ def compare(
     scan: Scan,
     motion: Motion,
     confidence: NDArray[np.float64],
+    believed: NDArray[np.bool_],
     volume: Image | None = None,
 ) -> Comparison:
     """Reconstruct slices and re-project some views, without and with the motion.
@@ -110,11 +111,13 @@ def compare(
         As estimated.
     confidence : ndarray, (views,)
         Of the estimate; the view with the least is shown.
+    believed : ndarray of bool, (views,)
+        Views to reconstruct from with the motion.
     volume : ndarray, (nz, ny, nx), optional
         By multigrid iteration, aligned: slices are of this one, and of one made without alignment.
     """
     slicer = (
-        Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS))
+        Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS), believed)
         if volume is None
         else MultigridSlicer(stream, scan, volume)
     )
@@ -127,7 +130,7 @@ def compare(
         detail=_detail(horizontal),
         voxel_mm=slicer.grid.voxel_size,
         method=slicer.method,
-        matches=_matches(stream, radiographs, scan.geometry, motion, confidence),
+        matches=_matches(stream, radiographs, scan.geometry, motion, confidence, believed),
         pixel_mm=_grid(scan.geometry, level).voxel_size,
     )
 
@@ -176,15 +179,18 @@ def _matches(
     geometry: ConeBeamGeometry,
     motion: Motion,
     confidence: NDArray[np.float64],
+    believed: NDArray[np.bool_],
 ) -> tuple[Match, ...]:
     chosen = _views_worth_showing(motion, confidence)
     views = sorted(chosen)
     measured = np.concatenate([radiographs.read(slice(view, view + 1)) for view in views])
     grid = _grid(geometry, radiographs.level)
     differences, simulated = [], measured
-    for name, full in (("before", geometry), ("after", geometry.with_motion(motion))):
+    moved = geometry.with_motion(motion)
+    for name, full, used in (("before", geometry, None), ("after", moved, believed)):
         here = full.binned(radiographs.level) if radiographs.level > 1 else full
-        volume = ramp_fbp(stream, radiographs, here, grid, stage=f"report: volume {name}")
+        stage = f"report: volume {name}"
+        volume = ramp_fbp(stream, radiographs, here, grid, believed=used, stage=stage)
         simulated = _reprojected(stream, volume, here.subset(views))
         pairs = [_fitted(s, m) for s, m in zip(simulated, measured, strict=True)]
         simulated = np.stack(pairs)

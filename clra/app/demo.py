@@ -103,7 +103,8 @@ def run_demo(
     scan = read_scan(folder / "scan.nxs")
     result = align(scan, schedule=schedule, device=device, progress=progress)
     command = f"clra align scan.nxs -o motion.h5 --schedule {schedule} --report report.html"
-    record = Record.of(result, scan, estimate="shift+scale", command=command)
+    about = {"estimate": "shift+scale", "unobservable": "taken out", "command": command}
+    record = Record.of(result, scan, **about)
     record.save(folder / "motion.h5")
     grid = default_grid(scan.geometry)
     for name, motion in (("before.h5", None), ("after.h5", record.motion)):

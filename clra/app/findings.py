@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+_LISTED = 20  # flagged views; the motion file and --json have them all
+
 
 @dataclass(frozen=True)
 class Errors:
@@ -32,10 +34,13 @@ class Errors:
     raw, gauge_free : ndarray, (views, 3)
         Estimate minus truth along u and v [pixel] and in magnification, as it is and without what
         a movement of the sample as a whole explains.
+    believed : ndarray of bool, (views,)
+        Views that were not flagged: the others' errors are those of a guess.
     """
 
     raw: Floats
     gauge_free: Floats
+    believed: NDArray[np.bool_]
 
     @classmethod
     def of(cls, record: Record, scan: Scan) -> "Errors | None":
@@ -58,18 +63,18 @@ class Errors:
         )
         points = sample_points(default_grid(scan.geometry))
         fit = Gauge(scan.geometry, points, magnification=record.scale_estimated).fit(difference)
-        return cls(raw=fit.part + fit.remainder, gauge_free=fit.remainder)
+        return cls(fit.part + fit.remainder, fit.remainder, record.believed)
 
     def means(self) -> dict[str, float]:
-        """Mean absolute errors by name."""
-        raw, free = (np.abs(errors).mean(axis=0) for errors in (self.raw, self.gauge_free))
+        """Mean absolute errors by name; those of believed views where some are not."""
+        errors = {"mae": self.raw, "gauge_free_mae": self.gauge_free}
+        if not self.believed.all():
+            errors |= {f"believed_{name}": of[self.believed] for name, of in errors.items()}
+        components = ("u", "v", "magnification")
         return {
-            "mae_u": float(raw[0]),
-            "mae_v": float(raw[1]),
-            "mae_magnification": float(raw[2]),
-            "gauge_free_mae_u": float(free[0]),
-            "gauge_free_mae_v": float(free[1]),
-            "gauge_free_mae_magnification": float(free[2]),
+            f"{name}_{component}": float(mean)
+            for name, of in errors.items()
+            for component, mean in zip(components, np.abs(of).mean(axis=0), strict=True)
         }
 
 
@@ -142,10 +147,17 @@ def findings_of(
     return Findings(
         record,
         errors=Errors.of(record, scan),
-        comparison=compare(stream, part, motion, record.confidence, volume),
-        quality=quality(stream, part, motion, volume_level(part)) if scan.views >= 4 else None,
+        comparison=compare(stream, part, motion, record.confidence, record.believed, volume),
+        quality=quality(stream, part, motion, volume_level(part), record.believed)
+        if _in_both_halves(record.believed)
+        else None,
         facts=Facts.of(scan).lines(),
     )
+
+
+def _in_both_halves(believed: NDArray[np.bool_]) -> bool:
+    """Whether two of the even views and two of the odd ones are left to compare."""
+    return bool(believed[::2].sum() > 1 and believed[1::2].sum() > 1)
 
 
 def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], str]:
@@ -189,8 +201,10 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
         "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
         f"largest {largest_u:.2f}, {largest_v:.2f}",
         "magnification": f"{least:.5f} to {most:.5f}",
-        "confidence": f"median {np.median(confidence):.3f}, {len(record.flagged)} views flagged",
+        "confidence": f"median {np.median(confidence):.3f}, {_flagged(record)}",
     }
+    if record.gauge:
+        lines["unobservable"] = _unobservable(record)
     if "panel_offset_u" in record.about:
         offset, tilt = (record.about[name] for name in ("panel_offset_u", "panel_tilt"))
         values |= {"panel_offset_u": offset, "panel_tilt": tilt}
@@ -202,11 +216,36 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
         values["source_travel"] = lines["source"] = record.about["source_travel"]
     if errors:
         means = errors.means()
-        lines["error"] = (
-            f"mean {means['mae_u']:.3f}, {means['mae_v']:.3f} pixel along u, v against the truth; "
-            f"gauge-free {means['gauge_free_mae_u']:.3f}, {means['gauge_free_mae_v']:.3f}"
-        )
+        lines["error"] = _error(means, "", record)
+        if record.flagged:
+            lines["not flagged"] = _error(means, "believed_", record)
     return values, table(lines)
+
+
+def _flagged(record: Record) -> str:
+    """Count and list the views that are not believed."""
+    few, count = ", ".join(map(str, record.flagged[:_LISTED])), len(record.flagged)
+    more = f" and {count - _LISTED} more" if count > _LISTED else ""
+    return f"{count} views flagged" + (f": {few}{more}" if count else "")
+
+
+def _unobservable(record: Record) -> str:
+    """Tell the gauge by mode, the largest first."""
+    parts = sorted(record.gauge.items(), key=lambda mode: -mode[1])
+    what = record.about.get("unobservable")
+    told = ", ".join(f"{name} {size:.2f}" for name, size in parts)
+    return f"{told} pixel rms" + (f", {what}" if what else "")
+
+
+def _error(means: Mapping[str, float], which: str, record: Record) -> str:
+    raw, free = (
+        f"{means[f'{which}{name}_u']:.3f}, {means[f'{which}{name}_v']:.3f}"
+        for name in ("mae", "gauge_free_mae")
+    )
+    scale = f"; magnification {means[f'{which}mae_magnification']:.1e}"
+    return f"mean {raw} pixel along u, v against the truth; gauge-free {free}" + (
+        scale if record.scale_estimated else ""
+    )
 
 
 def _levels(record: Record) -> str:

@@ -8,6 +8,9 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clra.app.records import Record
 from clra.io.atomic import ensure_writable
 from clra.io.errors import InputError, OutputError
@@ -40,7 +43,7 @@ def room_for(path: str | os.PathLike[str], size: int) -> None:
         raise OutputError.writing(path, errno.ENOSPC, found)
 
 
-def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion]:
+def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, NDArray[np.bool_]]:
     """Read the motion of a scan, and take the panel as the alignment took it.
 
     Parameters
@@ -56,6 +59,8 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion]:
         With the panel moved and turned as an auto-focus found it, if there was one.
     motion : Motion
         Relative to that.
+    believed : ndarray of bool, (views,)
+        Views that the alignment did not flag.
 
     Raises
     ------
@@ -65,7 +70,8 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion]:
     """
     file = read_motion_file(path)
     _check(scan, file.motion, file.attributes.get("checksum", ""), path)
-    return focused(scan, file.attributes, path), file.motion
+    believed = ~np.isin(np.arange(scan.views), file.flagged)
+    return focused(scan, file.attributes, path), file.motion, believed
 
 
 def matched(scan: Scan, record: Record, path: str | os.PathLike[str]) -> Scan:

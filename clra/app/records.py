@@ -28,6 +28,8 @@ class Record:
         As estimated.
     confidence : ndarray, (views,)
         0 to 1; 0 for a view that is not believed. All 1 where a file does not tell.
+    flagged : tuple of int
+        Views that are not believed.
     history : tuple of Iteration
         Of the run.
     gauge : mapping of str to float
@@ -36,20 +38,22 @@ class Record:
         Median standard errors of shift_u, shift_v [pixel] and magnification.
     about : mapping of str to str
         Where it comes from: "scan", "checksum", "path" (the trajectory's kind), "schedule",
-        "estimate", "device", "command", "version", as far as known.
+        "estimate", "unobservable" (whether the gauge was "taken out" of the motion or "left in"),
+        "device", "command", "version", as far as known.
     """
 
     motion: Motion
     confidence: NDArray[np.float64]
+    flagged: tuple[int, ...] = ()
     history: tuple[Iteration, ...] = ()
     gauge: Mapping[str, float] = field(default_factory=dict)
     sigma: tuple[float, float, float] | None = None
     about: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def flagged(self) -> NDArray[np.intp]:
-        """Views that are not believed."""
-        return np.flatnonzero(self.confidence == 0)
+    def believed(self) -> NDArray[np.bool_]:
+        """Views but for the flagged ones, (views,)."""
+        return ~np.isin(np.arange(self.motion.views), self.flagged)
 
     @property
     def scale_estimated(self) -> bool:
@@ -73,6 +77,7 @@ class Record:
         return cls(
             motion=result.motion,
             confidence=result.confidence,
+            flagged=result.flagged,
             history=tuple(result.history),
             gauge=result.gauge,
             sigma=(u, v, m),
@@ -106,6 +111,7 @@ class Record:
             path,
             self.motion,
             confidence=self.confidence,
+            flagged=self.flagged,
             history=self.history,
             **{key: self.about.get(key, "") for key in own},
             attributes={
@@ -135,6 +141,7 @@ class Record:
         return cls(
             motion=file.motion,
             confidence=unknown if file.confidence is None else file.confidence,
+            flagged=file.flagged,
             history=history_of(file),
             gauge=_gauge(file),
             sigma=_sigma(file),

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 _WITHOUT_SCAN = (
     "Slices and re-projections need the scan: clra report MOTION.h5 --scan SCAN -o report.html"
 )
+_COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
+_UNOBSERVABLE = {
+    "taken out": " It was taken out of the motion.",
+    "left in": " It was left in the motion; clra align --gauge anchored takes it out.",
+}
 _RETURNS = " Errors of the stage come mirrored about the dashed line, where it turns back."
 
 
@@ -168,6 +173,18 @@ def _history(history: Sequence[Iteration]) -> str:
 
 
 def _errors(errors: Errors) -> str:
+    means = errors.means()
+    names = {
+        "raw": "mae",
+        "gauge-free": "gauge_free_mae",
+        "raw, without flagged views": "believed_mae",
+        "gauge-free, without flagged views": "believed_gauge_free_mae",
+    }
+    rows = [
+        [told, *(f"{means[f'{name}_{c}']:{form}}" for c, form in _COMPONENTS.items())]
+        for told, name in names.items()
+        if f"{name}_u" in means
+    ]
     return page.section(
         "Error of each view",
         page.figure(
@@ -178,6 +195,7 @@ def _errors(errors: Errors) -> str:
             "which motion leaves no visible trace.",
             "Error of the shift against view number",
         ),
+        page.table(["mean absolute error", "u [pixel]", "v [pixel]", "magnification"], rows),
     )
 
 
@@ -245,7 +263,7 @@ def _match(match: "Match", pixel_mm: float) -> str:
 
 
 def _trust(record: Record) -> str:
-    flagged = record.flagged.tolist()
+    flagged = record.flagged
     parts = [
         page.figure(
             figures.confidence(record.confidence, flagged),
@@ -267,11 +285,12 @@ def _trust(record: Record) -> str:
         more = f" and {len(flagged) - 40} more" if len(flagged) > 40 else ""
         parts.append(page.paragraph(f"Flagged views: {', '.join(map(str, flagged[:40]))}{more}."))
     if record.gauge:
+        unobservable = record.about.get("unobservable", "")
         parts += [
             page.paragraph(
-                "Gauge content: root mean square of the part of the motion that each movement of "
-                "the sample as a whole would explain. Radiographs hardly see it, and the volume "
-                "is as sharp with it as without."
+                "Gauge content: root mean square of the part of the motion found that each "
+                "movement of the sample as a whole would explain. Radiographs hardly see it, and "
+                "the volume is as sharp with it as without." + _UNOBSERVABLE.get(unobservable, "")
             ),
             page.bars(record.gauge, "pixel"),
         ]

@@ -31,6 +31,8 @@ class Slicer:
         Of its views.
     level : int
         Binning factor to reconstruct at.
+    believed : ndarray of bool, (views,), optional
+        Views for the slices after correction, all by default; Katsevich's method needs all.
 
     Attributes
     ----------
@@ -40,10 +42,17 @@ class Slicer:
         What it reconstructs by, for reading.
     """
 
-    def __init__(self, stream: Stream, scan: Scan, motion: Motion, level: int) -> None:
+    def __init__(
+        self,
+        stream: Stream,
+        scan: Scan,
+        motion: Motion,
+        level: int,
+        believed: NDArray[np.bool_] | None = None,
+    ) -> None:
         whole = default_grid(scan.geometry)
         self.grid = whole.binned(level) if level > 1 else whole
-        self._stream = stream
+        self._stream, self._believed = stream, believed
         self._radiographs = Radiographs(stream, scan, level)
         before, after = scan.geometry, scan.geometry.with_motion(motion)
         self._geometries = [g.binned(level) if level > 1 else g for g in (before, after)]
@@ -75,8 +84,8 @@ class Slicer:
         stream, stage = self._stream, "report: slices"
         if self.method.startswith("ramp"):
             volumes = [
-                ramp_fbp(stream, self._radiographs, geometry, plane, stage=stage)
-                for geometry in (before, after)
+                ramp_fbp(stream, self._radiographs, geometry, plane, believed=believed, stage=stage)
+                for geometry, believed in ((before, None), (after, self._believed))
             ]
         else:
             volumes = [

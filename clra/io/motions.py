@@ -27,6 +27,11 @@ _MEANING = (
     "this holds at the depth of the rotation axis: the source moved, and the panel did not."
 )
 
+_FLAGGED = (
+    "Views, counted from 0, whose registration is not believed: they have the motion that lies "
+    "between their neighbours', and are best left out of a reconstruction."
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class MotionFile:
@@ -38,6 +43,9 @@ class MotionFile:
         The motion.
     confidence : ndarray of float64, (views,), or None
         0 to 1.
+    flagged : tuple of int
+        Views whose registration is not believed; where the file does not list them, those without
+        any confidence.
     history : dict of str to ndarray
         The run, a column of one value an iteration each; empty where the file tells none.
     attributes : dict of str to str
@@ -46,6 +54,7 @@ class MotionFile:
 
     motion: Motion
     confidence: Floats | None = None
+    flagged: tuple[int, ...] = ()
     history: dict[str, NDArray[Any]] = dataclasses.field(default_factory=dict)
     attributes: dict[str, str] = dataclasses.field(default_factory=dict)
 
@@ -55,6 +64,7 @@ def write_motion_file(
     motion: Motion,
     *,
     confidence: ArrayLike | None = None,
+    flagged: Sequence[int] = (),
     history: Sequence[Any] = (),
     schedule: str = "",
     device: str = "",
@@ -72,6 +82,8 @@ def write_motion_file(
         The motion.
     confidence : array_like, (views,), optional
         0 to 1.
+    flagged : sequence of int
+        Views whose registration is not believed, from 0.
     history : sequence of dataclass instances or mappings
         One an iteration, all with the same fields of numbers, text or None.
     schedule, device, scan, checksum : str
@@ -109,6 +121,8 @@ def write_motion_file(
                 )
             group["confidence"] = values
             group["confidence"].attrs["units"] = "1"
+        group["flagged"] = np.array(flagged, np.int64)
+        group["flagged"].attrs["meaning"] = _FLAGGED
         _write_history(file.create_group("history"), history)
         file.flush()
         image = file.id.get_file_image()
@@ -149,7 +163,8 @@ def read_motion_file(path: str | os.PathLike[str]) -> MotionFile:
         except ValueError as error:
             raise InputError(f"{os.fspath(path)}: /motion: {error}") from error
         attributes = {name: text(value) for name, value in file.attrs.items()}
-        return MotionFile(motion, confidence, _read_history(file), attributes)
+        flagged = _flagged(file, views, confidence)
+        return MotionFile(motion, confidence, flagged, _read_history(file), attributes)
 
 
 def _version() -> str:
@@ -166,6 +181,18 @@ def _column(dataset: h5py.Dataset) -> Floats:
         found = f"shape {dataset.shape} of {dataset.dtype}"
         raise InputError.at(*where, found, "a number for each view")
     return np.asarray(dataset[()], np.float64)
+
+
+def _flagged(file: h5py.File, views: int, confidence: Floats | None) -> tuple[int, ...]:
+    """Read which views are not believed."""
+    dataset = find(file, "motion/flagged")
+    if not isinstance(dataset, h5py.Dataset):
+        return () if confidence is None else tuple(np.flatnonzero(confidence == 0).tolist())
+    values = _column(dataset)
+    if not np.isin(values, np.arange(views)).all():
+        where = (file.filename, dataset.name)
+        raise InputError.at(*where, f"{values.tolist()}", f"numbers of views, 0 to {views - 1}")
+    return tuple(values.astype(int).tolist())
 
 
 def _write_history(group: h5py.Group, history: Sequence[Any]) -> None:

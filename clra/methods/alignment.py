@@ -247,8 +247,12 @@ class _Run:
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(radiographs, title=of)
-            if not self.history and (outliers(found.correlation) & ~self.weak).any():
-                found = self._without_outliers(found, radiographs, title=of)
+            wrong = outliers(found.correlation) & ~self.weak
+            if not self.history and wrong.any():
+                # They were in the first volume: again without, or what they did to the others stays
+                # in the modes that data hardly see, a tenth of all that is left of random motion.
+                self.weak, self.bias = self.weak | wrong, None
+                found = self._iterate(radiographs, title=of)
             update_u, update_v = update = np.abs(self._move(found))
             self.history.append(
                 Iteration.of(
@@ -269,17 +273,6 @@ class _Run:
             previous = update_size(update_u, update_v)[0]
         if len({entry.level for entry in self.history}) == 1:
             warn_of_lost_features(self.scan, found.correlation, stage.level, name)
-
-    def _without_outliers(
-        self, found: Registered, radiographs: Radiographs, *, title: str
-    ) -> Registered:
-        """Iterate again: wrong frames that only registration showed were in the first volume.
-
-        What they did to the others there would stay in the modes that data hardly see: a tenth of
-        all that is left in u, for the paper's random motion and half a per cent of such views.
-        """
-        self.weak, self.bias = self.weak | outliers(found.correlation), None
-        return self._iterate(radiographs, title=title)
 
     def _iterate(self, radiographs: Radiographs, *, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""

@@ -67,6 +67,7 @@ def imgr(
     scale: bool = True,
     anchor: bool = True,
     motion: Motion | None = None,
+    believed: NDArray[np.bool_] | None = None,
     truth: Motion | None = None,
     osem: OrderedSubsets | None = None,
     progressed: Progressed | None = None,
@@ -92,6 +93,8 @@ def imgr(
         movement of the sample would explain, see :func:`clra.align`.
     motion : Motion, optional
         Where to start; by default no motion.
+    believed : ndarray of bool, (views,), optional
+        Views to reconstruct from, all by default; where it aligns it finds out by itself.
     truth : Motion, optional
         To report errors against.
     osem : OrderedSubsets, optional
@@ -124,7 +127,8 @@ def imgr(
     cycles = cycles or (_CYCLES if align else _CYCLES_UNALIGNED)
     start = motion or Motion.identity(scan.views)
     run = _Run(stream, scan, with_margin(grid), factors, align, scale, anchor, osem, truth, start)
-    run.done = progressed or Progressed(None, start, np.zeros(scan.views, np.bool_))
+    weak = np.zeros(scan.views, np.bool_) if believed is None else ~believed
+    run.done = progressed or Progressed(None, start, weak)
     try:
         run.cycles(cycles)
         first = (run.grid.shape[0] - grid.shape[0]) // 2

@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clra.methods.imgr import imgr
 from clra.methods.osem_tr import OrderedSubsets, osem_tr, start_volume
@@ -26,6 +27,7 @@ def iterate(
     grid: VolumeGrid,
     motion: Motion | None,
     align: bool,
+    believed: NDArray[np.bool_] | None,
     options: Mapping[str, Any],
 ) -> None:
     """Reconstruct, and hand the volume on some planes at a time.
@@ -46,6 +48,8 @@ def iterate(
         Of the radiographs.
     align : bool
         Whether "imgr" aligns on the way.
+    believed : ndarray of bool or None, (views,)
+        Views to reconstruct from; "imgr" finds out by itself where it aligns.
     options : mapping
         As :func:`sorted_options` takes them.
 
@@ -56,15 +60,16 @@ def iterate(
     """
     osem, cycle = sorted_options(method, options)
     if method == "imgr":
-        found = imgr(stream, scan, grid, align=align, motion=motion, osem=osem, **cycle)
+        cycle |= {"align": align, "motion": motion, "believed": believed}
+        found = imgr(stream, scan, grid, osem=osem, **cycle)
         found.volume.write(target)
         return
     geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
     radiographs, wide = Radiographs(stream, scan, 1), with_margin(grid)
     osem = _widened(osem, grid, wide)
-    volume = start_volume(stream, radiographs, geometry, wide, osem)
+    volume = start_volume(stream, radiographs, geometry, wide, osem, believed=believed)
     used = np.ones(geometry.shape, np.bool_) if scan.mask is None else scan.mask
-    osem_tr(stream, radiographs, geometry, volume, osem, used=used)
+    osem_tr(stream, radiographs, geometry, volume, osem, used=used, believed=believed)
     cropped(stream, volume, (wide.shape[0] - grid.shape[0]) // 2, grid).write(target)
 
 

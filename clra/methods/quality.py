@@ -44,7 +44,13 @@ class Quality:
     sharpness: float
 
 
-def quality(stream: Stream, scan: Scan, motion: Motion, level: int) -> Quality:
+def quality(
+    stream: Stream,
+    scan: Scan,
+    motion: Motion,
+    level: int,
+    believed: NDArray[np.bool_] | None = None,
+) -> Quality:
     """Measure how good an alignment is by the radiographs alone.
 
     Takes two reconstructions of the whole scan at that level, two of half of it, and a
@@ -60,7 +66,10 @@ def quality(stream: Stream, scan: Scan, motion: Motion, level: int) -> Quality:
         Of its views.
     level : int
         Binning factor.
+    believed : ndarray of bool, (views,), optional
+        Views to reconstruct from with the motion, some even and some odd; all by default.
     """
+    used = np.ones(scan.views, np.bool_) if believed is None else believed
     grid = default_grid(scan.geometry).binned(level)
     radiographs = Radiographs(stream, scan, level)
     before, after = (g.binned(level) for g in (scan.geometry, scan.geometry.with_motion(motion)))
@@ -83,8 +92,9 @@ def quality(stream: Stream, scan: Scan, motion: Motion, level: int) -> Quality:
         )
 
     unexplained, gradients = [], []
-    for name, geometry in (("before", before), ("after", after)):
-        volume = ramp_fbp(stream, radiographs, geometry, grid, stage=f"report: volume {name}")
+    for name, geometry, chosen in (("before", before, None), ("after", after, used)):
+        stage = f"report: volume {name}"
+        volume = ramp_fbp(stream, radiographs, geometry, grid, believed=chosen, stage=stage)
         found = registered(geometry, volume, name, still=True)
         unexplained.append(float(np.median(np.sqrt(1 - np.clip(found.correlation, 0, 1) ** 2))))
         gradients.append(_gradient(volume.to_host()))
@@ -92,7 +102,8 @@ def quality(stream: Stream, scan: Scan, motion: Motion, level: int) -> Quality:
     for name, first in (("even views", 0), ("odd views", 1)):
         half = slice(first, None, 2)
         part = Radiographs(stream, Scan(radiographs, after).subset(half), 1)
-        volume = ramp_fbp(stream, part, after.subset(half), grid, stage=f"report: volume of {name}")
+        stage = f"report: volume of {name}"
+        volume = ramp_fbp(stream, part, after.subset(half), grid, believed=used[half], stage=stage)
         halves.append(registered(after, volume, f"from {name}", still=False).motion)
     even, odd = halves
     return Quality(

@@ -1,5 +1,6 @@
 """From a scan to a volume: picks the method and the defaults."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ def reconstruct(
     align: bool = False,
     device: Any = None,
     *,
+    believed: NDArray[np.bool_] | None = None,
     progress: Report | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
@@ -56,6 +58,9 @@ def reconstruct(
     device : str or cl.Device, optional
         As :func:`clra.ops.devices.choose_device` takes it, or "all" to share the work out to all
         devices of the best kind; alignment and iterative methods take the first of them.
+    believed : ndarray of bool, (views,), optional
+        Views to reconstruct from, such as ``result.confidence > 0``; all by default, and with
+        "katsevich", which needs every view. With `align` those that are not flagged.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
@@ -74,9 +79,9 @@ def reconstruct(
     Raises
     ------
     ValueError
-        If the method or an option of it is unknown, both `motion` and `align` are given, or the
-        scan is one that Katsevich's method cannot treat; says what pitch, panel or field of view
-        would do.
+        If the method or an option of it is unknown, no view is believed, both `motion` and `align`
+        are given, or the scan is one that Katsevich's method cannot treat; says what pitch, panel
+        or field of view would do.
     """
     planes = HostPlanes(grid or default_grid(scan.cropped().geometry))
     reconstruct_into(
@@ -87,6 +92,7 @@ def reconstruct(
         motion,
         align,
         device,
+        believed=believed,
         progress=progress,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
@@ -104,6 +110,7 @@ def reconstruct_into(
     align: bool = False,
     device: Any = None,
     *,
+    believed: NDArray[np.bool_] | None = None,
     progress: Report | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
@@ -116,7 +123,8 @@ def reconstruct_into(
     target : PlaneWriter
         Takes the planes, each once; :func:`clra.io.volumes.open_volume` gives one that writes a
         file.
-    scan, method, grid, motion, align, device, progress, max_device_memory, max_host_memory, options
+    scan, method, grid, motion, align, device, believed, progress, max_device_memory, \
+    max_host_memory, options
         As :func:`reconstruct` takes them.
 
     Raises
@@ -128,6 +136,11 @@ def reconstruct_into(
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
+    if believed is not None and (believed.shape != (scan.views,) or not believed.any()):
+        raise ValueError(
+            f"believed: found {believed.shape} with {believed.sum()} views, expected "
+            f"({scan.views},) with at least one"
+        )
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
     motion = None if motion is None else motion.about(*scan.window_aside)
     scan = scan.cropped()
@@ -143,10 +156,17 @@ def reconstruct_into(
         stream = Stream(devices[0], **limits)
         fitted = exact_helices(Radiographs(stream, scan, 1), scan.geometry, grid)
     if align and method != "imgr":
-        motion = align_scan(scan, device=devices[0], progress=progress, **limits).motion
+        aligned = align_scan(scan, device=devices[0], progress=progress, **limits)
+        motion = aligned.motion
+        believed = ~np.isin(np.arange(scan.views), aligned.flagged)
+    if method == "katsevich" and believed is not None and not believed.all():
+        warnings.warn(
+            f"katsevich needs every view: {(~believed).sum()} that are not believed are used, too",
+            stacklevel=2,
+        )
     if method in iterative.METHODS:
         stream = Stream(devices[0], report=progress, **limits)
-        iterative.iterate(stream, target, scan, method, grid, motion, align, options)
+        iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)
         return
 
     def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
@@ -158,7 +178,15 @@ def reconstruct_into(
         else:
             geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
             radiographs = Radiographs(stream, scan, 1)
-            ramp_fbp(stream, radiographs, geometry, grid, planes=planes, target=target)
+            ramp_fbp(
+                stream,
+                radiographs,
+                geometry,
+                grid,
+                believed=believed,
+                planes=planes,
+                target=target,
+            )
 
     if len(devices) == 1:
         stream = Stream(devices[0], report=progress, **limits)

@@ -14,6 +14,7 @@ def test_a_record_survives_its_file(record, scan, motion_file):
     loaded = Record.load(motion_file)
     assert loaded.motion == record.motion
     np.testing.assert_array_equal(loaded.confidence, record.confidence)
+    assert loaded.flagged == record.flagged
     assert loaded.history == record.history
     assert loaded.gauge == record.gauge and loaded.sigma == record.sigma
     assert {**record.about, "version": loaded.about["version"]} == loaded.about
@@ -34,8 +35,9 @@ def test_how_far_the_source_went_is_remembered_and_told(result, scan, tmp_path):
     assert "source_travel" not in summary_of(Record.of(result, scan), None)[0]
 
 
-def test_flagged_views_are_those_without_confidence(record):
-    assert record.flagged.tolist() == [3, 17]
+def test_flagged_views_are_not_believed(record):
+    assert record.flagged == (3, 17)
+    assert np.flatnonzero(~record.believed).tolist() == [3, 17]
     assert record.scale_estimated
 
 
@@ -52,4 +54,4 @@ def test_a_file_of_shifts_alone_is_enough(record, tmp_path):
     bare = Record.load(tmp_path / "bare.h5")
     assert bare.motion == record.motion
     assert bare.history == () and bare.gauge == {} and bare.sigma is None
-    assert not len(bare.flagged)
+    assert bare.flagged == () and bare.believed.all()

@@ -83,6 +83,7 @@ def test_the_page_tells_all_there_is(page, record):
         "re-projections",
         "translation x",
         "Flagged views: 3, 17",
+        "gauge-free, without flagged views",
         "2 of 24 views flagged",
         "1QR-1HR",
         "a device",

@@ -48,6 +48,7 @@ def test_everything_survives(tmp_path: Path, motion: Motion) -> None:
         path,
         motion,
         confidence=confidence,
+        flagged=[0, 7],
         history=history,
         schedule="1QR-1HR",
         device="a device",
@@ -58,6 +59,7 @@ def test_everything_survives(tmp_path: Path, motion: Motion) -> None:
     read = read_motion_file(path)
     assert read.motion == motion
     np.testing.assert_array_equal(read.confidence, confidence)
+    assert read.flagged == (0, 7)
     assert read.history["level"].tolist() == ["QR", "HR"]
     assert read.history["iteration"].tolist() == [1, 2]
     np.testing.assert_array_equal(read.history["mae"], [np.nan, 0.25])
@@ -78,6 +80,7 @@ def test_only_shifts_are_needed(tmp_path: Path) -> None:
     read = read_motion_file(path)
     assert read.motion == Motion(shift_u=[1, 2], shift_v=[3, 4])
     assert read.confidence is None
+    assert read.flagged == ()
     assert read.history == {}
 
 
@@ -89,6 +92,7 @@ def test_only_shifts_are_needed(tmp_path: Path) -> None:
         ({"shift_u": [np.nan], "shift_v": [1.0]}, "motion: shift_u: found .*nan.* finite"),
         ({"shift_u": [1.0], "shift_v": [[1.0]]}, r"shift_v: found shape \(1, 1\)"),
         ({"shift_u": [1.0], "shift_v": [1.0], "magnification": [0.0]}, "magnification"),
+        ({"shift_u": [1.0], "shift_v": [1.0], "flagged": [1]}, r"flagged: found \[1.0\], expected"),
     ],
 )
 def test_damaged_files(tmp_path: Path, columns: dict[str, list[float]], message: str) -> None:
@@ -99,6 +103,15 @@ def test_damaged_files(tmp_path: Path, columns: dict[str, list[float]], message:
     with pytest.raises(InputError, match=message) as caught:
         read_motion_file(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_file_without_a_list_flags_what_has_no_confidence(tmp_path: Path) -> None:
+    path = tmp_path / "motion.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in {"shift_u": [1, 2, 3], "shift_v": [3, 4, 5]}.items():
+            file[f"motion/{name}"] = values
+        file["motion/confidence"] = [0.9, 0.0, 0.8]
+    assert read_motion_file(path).flagged == (1,)
 
 
 def test_confidence_of_another_length(tmp_path: Path, motion: Motion) -> None:

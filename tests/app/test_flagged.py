@@ -1,0 +1,111 @@
+"""A scan with bad views, as a user meets it: told, listed, and left out of the volume."""
+
+import json
+import re
+
+import h5py
+import numpy as np
+import pytest
+
+from clra.app.simulate import paper_like, sample, simulated_motion
+from clra.io.motions import read_motion_file, write_motion_file
+from clra.io.scans import read_scan, write_scan
+from clra.io.volumes import read_volume
+from clra.model.scan import Scan
+
+VIEWS, BLANK, SATURATED = 60, 11, 40
+
+
+def spoilt(scan, values):
+    pixels = scan.read(0, scan.views).copy()
+    pixels[[BLANK, SATURATED]] = np.reshape(values, (2, 1, 1))
+    return Scan(pixels, scan.geometry, truth=scan.truth, name="spoilt")
+
+
+@pytest.fixture(scope="module")
+def measured():
+    geometry = paper_like("space-filling", VIEWS, (72, 64))
+    truth = simulated_motion("random", geometry, shift=(-3.0, 3.0), magnification=0.002)
+    moved = geometry.with_motion(truth)
+    return Scan(sample("porous", geometry).line_integrals(moved), geometry, truth=truth)
+
+
+@pytest.fixture(scope="module")
+def bad_file(measured, tmp_path_factory):
+    path = tmp_path_factory.mktemp("bad") / "bad.nxs"
+    write_scan(path, spoilt(measured, [0.0, 9.0]))
+    return path
+
+
+def lines_of(text):
+    return dict(re.findall(r"^([\w ]+): +(.*)$", text, re.MULTILINE))
+
+
+def test_flagged_views_and_the_unobservable_are_told_and_kept(clra, bad_file, tmp_path):
+    motion, page = tmp_path / "m.h5", tmp_path / "r.html"
+    code, out, err = clra(
+        "align", bad_file, "-o", motion, "--schedule", "1QR-1HR", "--report", page
+    )
+    assert code == 0, err
+    told = lines_of(out)
+    assert told["confidence"].endswith(f"2 views flagged: {BLANK}, {SATURATED}")
+    with h5py.File(motion) as file:
+        assert file["motion/flagged"][()].tolist() == [BLANK, SATURATED]
+        assert not file["motion/confidence"][()][[BLANK, SATURATED]].any()
+        modes = json.loads(file.attrs["gauge"])
+        found = {name: file[f"motion/{name}"][()] for name in ("shift_u", "magnification")}
+    # Each movement of the sample with its size, the largest first.
+    parts = re.findall(r"([a-z]+(?: [xyz])?) (\d+\.\d\d)", told["unobservable"])
+    assert {name: float(size) for name, size in parts} == pytest.approx(modes, abs=0.006)
+    assert [size for _, size in parts] == sorted((size for _, size in parts), reverse=True)
+    assert told["unobservable"].endswith("taken out")
+    # Raw errors over all views, as printed, from the files themselves.
+    truth = read_scan(bad_file).truth
+    believed = np.delete(np.arange(VIEWS), [BLANK, SATURATED])
+    for name, views in (("error", slice(None)), ("not flagged", believed)):
+        u = np.abs(found["shift_u"] - truth.shift_u)[views].mean()
+        m = np.abs(found["magnification"] - truth.magnification)[views].mean()
+        assert told[name].startswith(f"mean {u:.3f}, ")
+        assert told[name].endswith(f"; magnification {m:.1e}")
+        assert "gauge-free" in told[name]
+    html = page.read_text(encoding="utf-8")
+    for part in (
+        f"Flagged views: {BLANK}, {SATURATED}.",
+        "It was taken out of the motion.",
+        "gauge-free, without flagged views",
+        "stretch z",
+    ):
+        assert part in html
+
+
+def test_the_unobservable_stays_if_it_is_to(clra, bad_file, tmp_path):
+    found = {}
+    for gauge, fate in (("anchored", "taken out"), ("free", "left in")):
+        motion = tmp_path / f"{gauge}.h5"
+        options = ["-o", motion, "--schedule", "1QR", "--gauge", gauge]
+        code, out, err = clra("align", bad_file, *options)
+        assert code == 0, err
+        assert lines_of(out)["unobservable"].endswith(fate)
+        page = tmp_path / f"{gauge}.html"
+        assert clra("report", motion, "-o", page)[0] == 0
+        assert f"It was {fate}" in page.read_text(encoding="utf-8")
+        found[gauge] = read_motion_file(motion).motion
+    # A translation along z is a constant in v.
+    assert abs(found["free"].shift_v.mean()) > 2 * abs(found["anchored"].shift_v.mean())
+
+
+@pytest.mark.parametrize("method", ["fbp", "imgr"])
+def test_flagged_views_are_left_out_of_the_volume(clra, measured, tmp_path, method):
+    motion = tmp_path / "m.h5"
+    write_motion_file(motion, measured.truth, flagged=[BLANK, SATURATED])
+    volumes = []
+    for name, values in (("bad", [0.0, 9.0]), ("worse", [7.0, -5.0])):
+        path = tmp_path / f"{name}.nxs"
+        write_scan(path, spoilt(measured, values))
+        out = tmp_path / f"{name}.h5"
+        options = ["--motion", motion, "--method", method, "-o", out]
+        code, _, err = clra("reconstruct", path, *options, "--quiet")
+        assert code == 0, err
+        volumes.append(read_volume(out)[0])
+    assert volumes[0].std() > 0
+    assert np.array_equal(*volumes)
