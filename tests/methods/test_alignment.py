@@ -118,6 +118,22 @@ def test_bad_views_are_listed_and_spoil_nothing_else(moved):
         assert getattr(with_bad, name) < 1.05 * getattr(without, name) + 0.005
 
 
+def test_wrong_frames_leave_no_trace_in_the_others(moved):
+    pixels = moved.read(0, VIEWS)
+    bad = [20, 66, 107, 150]
+    found = []
+    # Blank ones are known from the start, wrong ones only from their registration.
+    for put in (0 * pixels[bad], pixels[[view + 9 for view in bad]]):
+        spoilt = pixels.copy()
+        spoilt[bad] = put
+        found.append(clra.align(clra.Scan(spoilt, moved.geometry), schedule="1QR"))
+    blank, wrong = found
+    assert blank.flagged == wrong.flagged == tuple(bad)
+    for name in ("shift_u", "shift_v", "magnification"):
+        difference = getattr(wrong.motion, name) - getattr(blank.motion, name)
+        assert np.abs(difference).max() < 1e-4
+
+
 def test_shift_only_leaves_the_magnification_alone(geometry):
     truth, _ = _truth(geometry, 0.0)
     rock = porous(RADIUS, 2.0, seed=4)
