@@ -36,10 +36,11 @@ def draw(
     for axis, (trajectory, component) in zip(axes[2], plots, strict=True):
         for name, found in runs.items():
             start = f"{size} {trajectory} "
-            if not name.startswith(start) or "magnification" in name:
-                continue
-            motion, who, schedule = name.removeprefix(start).split()
-            style = {"ls": DASHES[motion], "color": STYLES[schedule], "lw": WIDTHS[who]}
+            motion, who, schedule, *more = (*name.removeprefix(start).split(), "", "")
+            if not name.startswith(start) or who not in WIDTHS or any(more):
+                continue  # of another scan, with magnification, or without a part of the solver
+            colour = STYLES.get(schedule, "0.6")
+            style = {"ls": DASHES[motion], "color": colour, "lw": WIDTHS[who]}
             cost = np.cumsum([COST[step["level"]] for step in found["iterations"]])
             mae = [step[f"mae_{component}"] for step in found["iterations"]]
             axis.plot(cost, mae, marker=".", ms=4, **style)
