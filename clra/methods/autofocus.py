@@ -2,7 +2,9 @@
 
 Re-projection alignment takes the static geometry for granted: a wrong centre of rotation it can
 still shift away, a panel turned in its plane it cannot. A few slices are reconstructed with many
-candidates and the sharpest is taken [1]_.
+candidates and the sharpest is taken [1]_. Where the radiographs jitter, what is sharpest is off by
+some tenths of a pixel and of a degree: a short alignment at a low resolution finds most of the
+jitter, and with it known the slices are made as sharp as they can be.
 
 References
 ----------
@@ -10,18 +12,19 @@ References
    of tomographic projection data by passive auto-focus", Med. Phys. 38, 4934 (2011).
 """
 
+import warnings
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods.alignment import align
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
-from clra.model.motion import Motion
 from clra.model.panel import with_panel
 from clra.model.scan import Scan
+from clra.model.schedule import level_name
 from clra.ops.filtering import RampFilter, taper
 from clra.ops.projector import BackProjector
 from clra.ops.streaming import Radiographs, Report, Stream
@@ -40,10 +43,11 @@ _PLANES, _REACH = 7, 0.8
 # Part of the field of view's radius in which sharpness counts, in the search and in the refinement:
 # with a large offset its border gets edges of its own, which outdo those of a round sample.
 _SEARCH_INSIDE, _INSIDE = 0.7, 0.9
-# Rounds of the refinement, each a paraboloid through 3 x 3 candidates, this much closer than the
-# last: the last ones are a twentieth of a pixel of the level and 0.01 degrees apart. With three
-# rounds 0.2 pixels and, in round samples on a circle, 0.4 degrees are missed.
-_ROUNDS, _SHRINK = 5, 0.5
+# Iterations of the short alignment, and fewest rows and columns that it takes.
+_ITERATIONS, _SMALLEST = 2, 16
+# Rounds of the refinement: offset and tilt in turn, by parabolas through points first this far
+# apart [pixel of the level, rad] and in each round closer.
+_ROUNDS, _STEPS, _SHRINK = 4, (0.5, np.radians(0.5)), 0.5
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,6 @@ def autofocus(
     scan: Scan,
     device: Any = None,
     *,
-    motion: Motion | None = None,
     progress: Report | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
@@ -84,12 +87,9 @@ def autofocus(
     Parameters
     ----------
     scan : Scan
-        Any trajectory of at least a whole turn; it may have moved: blur changes little in where
-        slices are sharpest.
+        Any trajectory of at least a whole turn; it may have moved.
     device : str or cl.Device, optional
         As :func:`clra.ops.devices.choose_device` takes it.
-    motion : Motion, optional
-        Known so far.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
@@ -105,63 +105,86 @@ def autofocus(
     ValueError
         If the best lies at the end of what is searched, or slices have no structure.
     """
-    stream = Stream(
-        device,
-        max_device_memory=max_device_memory,
-        max_host_memory=max_host_memory,
-        report=progress,
-    )
+    limits: dict[str, Any] = {
+        "max_device_memory": max_device_memory,
+        "max_host_memory": max_host_memory,
+    }
+    stream = Stream(device, report=progress, **limits)
     every = max(1, scan.views // _VIEWS)
     scan = scan.subset(slice(0, None, every))
-    known = scan.geometry
-    if motion is not None:
-        known = known.with_motion(motion.subset(slice(0, None, every)))
-    total = len(_OFFSETS) + len(_TILTS)
-    coarse = _Slices(stream, scan, known, _SEARCH_COLUMNS, _SEARCH_INSIDE)
-    offsets = _OFFSETS * scan.geometry.columns
+    coarse = _Slices(stream, scan, scan.geometry, _SEARCH_COLUMNS, _SEARCH_INSIDE)
+    rough = _searched(coarse, scan)
+    focused = replace(scan, geometry=with_panel(scan.geometry, offset_u=rough[0], tilt=rough[1]))
+    schedule = f"{_ITERATIONS}{level_name(_level(scan, coarse.pixel))}"
+    del coarse  # its memory is the alignment's
+    with warnings.catch_warnings():
+        # Of these few views and pixels; the alignment proper judges for itself.
+        warnings.simplefilter("ignore")
+        found = align(
+            focused,
+            schedule=schedule,
+            estimate="shift",
+            device=stream.device,
+            progress=progress,
+            **limits,
+        )
+    fine = _Slices(stream, scan, focused.geometry.with_motion(found.motion), _COLUMNS, _INSIDE)
+    more = _climbed(fine)
+    return Focus(
+        # Slices are sharp with the axis in one place; motions are about its mean.
+        offset_u=rough[0] + more[0] + float(found.motion.shift_u.mean()),
+        tilt=rough[1] + more[1],
+        sharpening=fine.sharpness(*more) / fine.sharpness(-rough[0], -rough[1]),
+    )
 
-    def searched(candidates: list[tuple[float, float]], done: int) -> int:
+
+def _searched(slices: "_Slices", scan: Scan) -> tuple[float, float]:
+    """Return the offset and then the tilt of sharpest slices, from far and wide."""
+    offsets = _OFFSETS * scan.geometry.columns
+    total = len(offsets) + len(_TILTS)
+
+    def sharpest(candidates: list[tuple[float, float]], done: int) -> int:
         sharpness = []
         for k, (offset, tilt) in enumerate(candidates):
-            stream.report("auto-focus: searching", done + k, total)
-            sharpness.append(coarse.sharpness(offset, tilt))
+            slices.stream.report("auto-focus: searching", done + k, total)
+            sharpness.append(slices.sharpness(offset, tilt))
         return int(np.argmax(sharpness))
 
-    best = searched([(offset, 0.0) for offset in offsets], 0)
-    turned = searched([(offsets[best], tilt) for tilt in _TILTS], len(offsets))
-    stream.report("auto-focus: searching", total, total)
-    if not coarse.structure:
+    best = sharpest([(offset, 0.0) for offset in offsets], 0)
+    turned = sharpest([(offsets[best], tilt) for tilt in _TILTS], len(offsets))
+    slices.stream.report("auto-focus: searching", total, total)
+    if not slices.structure:
         raise ValueError(f"{scan.name}: found no structure in any slice, expected a sample")
     if best in (0, len(offsets) - 1):
         raise ValueError(
             f"{scan.name}: found slices still getting sharper at an offset of "
             f"{offsets[best]:.4g} pixels, expected the axis nearer to where the geometry has it"
         )
-    fine = _Slices(stream, scan, known, _COLUMNS, _INSIDE)
-    return _refined(fine, offsets[best], _TILTS[turned])
+    return float(offsets[best]), float(_TILTS[turned])
 
 
-def _refined(slices: "_Slices", offset: float, tilt: float) -> Focus:
-    """Climb from the best of the search."""
-    before = slices.sharpness(0.0, 0.0)
-    best = np.array([offset, tilt])
-    step = np.array([slices.pixel, np.radians(0.25)])
-    grid = np.array(list(product((-1.0, 0.0, 1.0), repeat=2)))
-    x, y = grid.T
-    design = np.stack([np.ones(9), x, y, x * x, x * y, y * y], axis=1)
+def _level(scan: Scan, level: int) -> int:
+    """Return the level, or a finer one if it leaves too few rows or columns."""
+    while level > 1 and min(scan.geometry.shape) // level < _SMALLEST:
+        level //= 2
+    return level
+
+
+def _climbed(slices: "_Slices") -> tuple[float, float]:
+    """Climb from offset and tilt 0 to sharpest slices."""
+    best = np.zeros(2)
+    steps = np.diag([_STEPS[0] * slices.pixel, _STEPS[1]])
     for round_ in range(_ROUNDS):
         slices.stream.report("auto-focus: refining", round_, _ROUNDS)
-        values = [np.log(slices.sharpness(*(best + at * step))) for at in grid]
-        _, gx, gy, cx, cxy, cy = np.linalg.lstsq(design, np.array(values), rcond=None)[0]
-        hessian = np.array([[2 * cx, cxy], [cxy, 2 * cy]])
-        highest = grid[int(np.argmax(values))]
-        peaked = np.linalg.eigvalsh(hessian).max() < 0
-        move = -np.linalg.solve(hessian, [gx, gy]) if peaked else highest
-        # A paraboloid is good for no more than where it was fitted, and a little beyond.
-        best = best + np.clip(move, -1.5, 1.5) * step
-        step *= _SHRINK
+        for step in steps:
+            lower, here, higher = (np.log(slices.sharpness(*(best + k * step))) for k in (-1, 0, 1))
+            slope, bend = 0.5 * (higher - lower), higher - 2 * here + lower
+            move = -slope / bend if bend < 0 else np.sign(slope)
+            # A parabola is good for no more than where it was fitted, and a little beyond.
+            best = best + np.clip(move, -1.5, 1.5) * step
+        steps = steps * _SHRINK
     slices.stream.report("auto-focus: refining", _ROUNDS, _ROUNDS)
-    return Focus(float(best[0]), float(best[1]), slices.sharpness(*best) / before)
+    return float(best[0]), float(best[1])
 
 
 class _Slices:

@@ -10,7 +10,7 @@ from clra.model.perturbation import smooth_motion
 from clra.model.phantom import porous
 
 # Fan 67 degrees: half of a lateral shift differs across the depth of the sample.
-VIEWS, SHAPE = 180, (96, 96)
+VIEWS, SHAPE = 120, (96, 96)
 WOOD = {"source_to_axis": 2.8823, "source_to_detector": 315.5, "pixel_size": 422.56 / 96}
 HEIGHT = 48 * 422.56 / 96 * 2.8823 / 315.5
 
