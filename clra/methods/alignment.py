@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.acceleration import MotionSteps
-from clra.methods.fbp import ramp_fbp
 from clra.methods.imgr import imgr
+from clra.methods.level import Level
 from clra.methods.limits import warn_of_far_motion, warn_of_lost_features
 from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
 from clra.methods.reference import align_to_reference
-from clra.methods.refinement import refine
-from clra.methods.reprojection import Registered, reproject_and_register, with_margin
+from clra.methods.reprojection import Registered, with_margin
 from clra.methods.results import AlignmentInterrupted, AlignmentResult, Iteration
 from clra.methods.solver import Solver
 from clra.model.gauge import Gauge, sample_points
@@ -30,7 +29,7 @@ from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import Stage, converged, level_name, parse_schedule, update_size
-from clra.ops.streaming import Radiographs, Report, Stream
+from clra.ops.streaming import Report, Stream
 
 Floats = NDArray[np.float64]
 
@@ -211,7 +210,6 @@ class _Run:
     registered: Registered = field(init=False)
     found: Motion = field(init=False)  # by the last iteration, with its gauge
     weak: NDArray[np.bool_] = field(init=False)
-    bias: Motion | None = field(init=False)  # of what a level's registrations find
 
     def __post_init__(self) -> None:
         self.motion = self.start
@@ -237,22 +235,21 @@ class _Run:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level)."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        radiographs = Radiographs(self.stream, self.scan, stage.level)
+        level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
         if not self.history:
-            self.weak = odd_radiographs(self.stream, radiographs)
+            self.weak = odd_radiographs(self.stream, level.radiographs)
         self.steps.restart()
-        self.bias = None
         previous = None
         for iteration in range(1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
-            found = self._iterate(radiographs, title=of)
+            found = self._iterate(level, title=of)
             wrong = outliers(found.correlation) & ~self.weak
             if not self.history and wrong.any():
                 # They were in the first volume: again without, or what they did to the others stays
                 # in the modes that data hardly see, a tenth of all that is left of random motion.
-                self.weak, self.bias = self.weak | wrong, None
-                found = self._iterate(radiographs, title=of)
+                self.weak, level.bias = self.weak | wrong, None
+                found = self._iterate(level, title=of)
             update_u, update_v = update = np.abs(self._move(found))
             self.history.append(
                 Iteration.of(
@@ -274,52 +271,19 @@ class _Run:
         if len({entry.level for entry in self.history}) == 1:
             warn_of_lost_features(self.scan, found.correlation, stage.level, name)
 
-    def _iterate(self, radiographs: Radiographs, *, title: str) -> Registered:
+    def _iterate(self, level: Level, *, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""
-        stream, level, solver = self.stream, radiographs.level, self.solver
         first = not self.history
-        # Motions are in full-resolution pixels: absorb first, then bin.
-        geometry = self.scan.geometry.with_motion(self.motion).binned(level)
         shifts_only = first and self._shifts_first
-        measure = solver.is_biased(geometry.shape) and self.bias is None and not shifts_only
-        options: dict[str, Any] = {"believed": ~self.weak, "circle": solver.circle}
-        # 2: reconstruct from the corrected radiographs
-        volume = ramp_fbp(
-            stream,
-            radiographs,
-            geometry,
-            self.grid.binned(level) if level > 1 else self.grid,
-            stage=f"{title}: reconstructing",
-            volumes=2 if measure else 1,
-            **options,
+        return level.residual_motion(
+            self.motion,
+            self.motion.magnification / self.start.magnification,
+            believed=~self.weak,
+            first=first,
+            magnification=self.scale and not shifts_only,
+            measure=not shifts_only,
+            title=title,
         )
-
-        # 3, 4: simulate and register
-        def registered() -> Registered:
-            return reproject_and_register(
-                stream,
-                radiographs,
-                volume,
-                geometry,
-                solver.registration(
-                    stream,
-                    self.scan,
-                    radiographs,
-                    first=first,
-                    magnification=self.scale and not shifts_only,
-                ),
-                magnification=self.motion.magnification / self.start.magnification,
-                lost=(self.scan.geometry.rows % level, self.scan.geometry.columns % level),
-                stage=f"{title}: registering",
-            )
-
-        found = registered()
-        if measure:
-            refine(stream, radiographs, volume, geometry, stage=title, **options)
-            self.bias = registered().motion.inverse().then(found.motion)
-        if self.bias is None:
-            return found
-        return replace(found, motion=self.bias.inverse().then(found.motion))
 
     def _move(self, found: Registered) -> Floats:
         """Algorithm 1, step 5: append what was found; returns the plain step in u and v."""

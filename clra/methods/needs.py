@@ -109,10 +109,9 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     """
     geometry = full.binned(level) if level > 1 else full
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
-    kept = _bytes(geometry) if level > 1 else 0
-    # On small panels there is a correction of the reconstruction beside it, see `refine`.
-    volumes = 2 if Solver().is_biased(geometry.shape) else 1
-    return _registering_need(budgets, full, geometry, grid, volumes, [kept])
+    # On small panels its re-projections are kept beside the radiographs.
+    count = int(level > 1) + int(Solver().is_biased(geometry.shape))
+    return _registering_need(budgets, full, geometry, grid, 1, [_bytes(geometry)] * count)
 
 
 def multigrid_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid) -> Need:
@@ -164,10 +163,11 @@ def _registering_need(
     )
     reading = _chunk(budgets, full)
     first = reconstruction_need(budgets, geometry, grid, volumes=volumes)
-    lacking = _projecting(budgets, geometry, chunk) + chunk + (0 if on_host else slab)
-    lacking *= volumes - 1
+    # A volume that is updated stays beside the update.
+    beside = _projecting(budgets, geometry, chunk) + chunk + (0 if on_host else slab)
+    beside *= volumes - 1
     steps = (
-        Need(first.device + lacking, first.host + shared * lacking),
+        Need(first.device + beside, first.host + shared * beside),
         Need(registering, int(shared * registering + _READING * chunk)),
         Need(0 if shared else reading, int(_READING * reading)),
     )

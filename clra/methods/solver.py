@@ -37,9 +37,10 @@ class Solver:
         Reconstruct nothing outside the circle that all views see.
     unbias : bool
         Once at each level whose images are small, find how far the artefacts of the reconstruction
-        displace its re-projections, by :func:`clra.methods.refinement.refine`, and take it off what
-        all its iterations find. Soft modes add it up: to 1e-3 of magnification at an eighth of the
-        paper's resolution, where the volume is blurred most. It hardly depends on the motion.
+        displace its re-projections, see :func:`clra.methods.level.consistent_radiographs`, and take
+        it off what all its iterations find. Soft modes add it up: to 1e-3 of magnification at an
+        eighth of the paper's resolution, where the volume is blurred most. It hardly depends on the
+        motion.
     shifts_first : bool
         Leave the magnification alone in the first of several iterations: radiographs that do not
         fit each other yet tell a wrong one, 3e-3 for the paper's smooth motion on a helix, which
