@@ -119,14 +119,24 @@ class Level:
                 stage=f"{title}: {doing}",
             )
 
+        def projected(volume: Volume, lacking_of: Radiographs | None = None) -> Radiographs:
+            return reprojections(
+                self.stream,
+                volume,
+                geometry,
+                self.factor,
+                f"{title}: simulating",
+                lacking_of=lacking_of,
+            )
+
         # 2: reconstruct from the corrected radiographs
         volume = reconstructed(self.radiographs, "reconstructing")
         # 3, 4: simulate and register
         found = registered(self.radiographs, volume, "registering")
         if measure and self.bias is None and self.solver.is_biased(geometry.shape):
-            still = consistent_radiographs(
-                self.stream, volume, geometry, self.factor, f"{title}: simulating"
-            )
+            if self.solver.is_blurred(geometry.shape):
+                volume = reconstructed(projected(volume, self.radiographs), "sharpening")
+            still = projected(volume)
             del volume
             volume = reconstructed(still, "reconstructing what is simulated")
             self.bias = registered(still, volume, "registering what is simulated").motion
@@ -135,16 +145,25 @@ class Level:
         return replace(found, motion=self.bias.inverse().then(found.motion))
 
 
-def consistent_radiographs(
-    stream: Stream, volume: Volume, geometry: ConeBeamGeometry, level: int, stage: str
+def reprojections(
+    stream: Stream,
+    volume: Volume,
+    geometry: ConeBeamGeometry,
+    level: int,
+    stage: str,
+    *,
+    lacking_of: Radiographs | None = None,
 ) -> Radiographs:
     """Return the re-projections ``A x`` of a volume x, kept like binned radiographs.
 
     Off circles, and far from their plane, ramp-filtered back-projection B is no inverse of the
     projection A, and re-projections ``A B p`` of radiographs p are displaced by its artefacts: by
     0.3 pixel in v for a helix whose views look 34 degrees up and down. How far depends on what the
-    sample looks like, and x looks like it. These radiographs fit each other and their geometry
+    sample looks like, and x looks like it. Its re-projections fit each other and their geometry
     exactly: whatever a registration finds of them against their own ``A B A x`` is displacement.
+
+    The more x is blurred, the less it looks like the sample. A volume from ``p + (p - A x)`` is
+    sharper: ``x + B (p - A x)``, two terms of the Neumann series for the inverse.
 
     Parameters
     ----------
@@ -158,6 +177,8 @@ def consistent_radiographs(
         Binning factor that they shall count as.
     stage : str
         What progress reports call this.
+    lacking_of : Radiographs, optional
+        Return these and what they have beyond the re-projections instead.
     """
     project = SlabProjector(stream, volume, geometry)
     kept = Store((geometry.views, *geometry.shape), stream.room)
@@ -166,6 +187,7 @@ def consistent_radiographs(
         stream.report(stage, views.start, geometry.views)
         projected = stream.empty((views.stop - views.start, *geometry.shape))
         project(projected, views)
-        kept.write(views.start, stream.download(projected))
+        part = stream.download(projected)
+        kept.write(views.start, part if lacking_of is None else 2 * lacking_of.read(views) - part)
     stream.report(stage, geometry.views, geometry.views)
     return radiographs

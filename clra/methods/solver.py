@@ -14,6 +14,11 @@ from clra.ops.streaming import Radiographs, Stream
 # Diagonal of the images, pixels, from which on re-projections are good as they are: at half of the
 # paper's resolution, 530 pixels, they are displaced by 0.008 pixel in v and 5e-5 in magnification.
 _GOOD = 400
+# And from which on they are sharp enough to tell how far they are displaced. Scans of 232 x 128, in
+# images of 116 x 64 and half of it, end at 0.010 pixel in v and 2.8e-4 in magnification instead of
+# 0.016 and 3.2e-4 (helix, random motion) with volumes sharpened before, a scan of 135 x 160 at 0.33
+# pixel in u instead of 0.39.
+_SHARP = 200
 
 ESTIMATORS = ("gauss-newton", "phase-correlation")
 
@@ -37,8 +42,8 @@ class Solver:
         Reconstruct nothing outside the circle that all views see.
     unbias : bool
         Once at each level whose images are small, find how far the artefacts of the reconstruction
-        displace its re-projections, see :func:`clra.methods.level.consistent_radiographs`, and take
-        it off what all its iterations find. Soft modes add it up: to 1e-3 of magnification at an
+        displace its re-projections, see :func:`clra.methods.level.reprojections`, and take it off
+        what all its iterations find. Soft modes add it up: to 1e-3 of magnification at an
         eighth of the paper's resolution, where the volume is blurred most. It hardly depends on the
         motion.
     shifts_first : bool
@@ -98,6 +103,10 @@ class Solver:
     def is_biased(self, shape: tuple[int, int]) -> bool:
         """Whether what is found with images of (rows, columns) has to be corrected."""
         return self.unbias and float(np.hypot(*shape)) < _GOOD
+
+    def is_blurred(self, shape: tuple[int, int]) -> bool:
+        """Whether a volume is sharpened before it tells the displacement of (rows, columns)."""
+        return float(np.hypot(*shape)) < _SHARP
 
     def acceleration(self) -> Anderson:
         """Return an extrapolation that knows no steps yet."""

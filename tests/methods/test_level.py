@@ -7,14 +7,14 @@ import pyopencl.array as cl_array
 import pytest
 
 import clra
-from clra.methods.level import Level, consistent_radiographs
+from clra.methods.level import Level, reprojections
 from clra.methods.solver import Solver
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.phantom import Ellipsoids
 from clra.ops.projector import ForwardProjector
 from clra.ops.slabs import volume_from
-from clra.ops.streaming import Stream
+from clra.ops.streaming import Radiographs, Stream
 
 VIEWS = 121
 SAME = 1e-5  # of the largest magnitude
@@ -71,15 +71,20 @@ def test_slabs_and_chunks_change_nothing(scan):
 
 
 @pytest.mark.parametrize("memory", [None, 1 << 19])
-def test_consistent_radiographs_are_projections(scan, memory):
+def test_reprojections_are_projections(scan, memory):
     stream = Stream(max_device_memory=memory)
     grid, geometry = GRID.binned(2), scan.geometry.binned(2)
     values = BODY.volume(grid).astype(np.float32)
     volume = volume_from(stream, grid, values)
     assert (len(volume.planes) > 1) == (memory is not None)
-    made = consistent_radiographs(stream, volume, geometry, 2, "test")
+    measured = Radiographs(stream, scan, 2)
+    made = reprojections(stream, volume, geometry, 2, "test")
+    more = reprojections(stream, volume, geometry, 2, "test", lacking_of=measured)
     assert (made.shape, made.level) == ((VIEWS, 57, 47), 2)
     project = ForwardProjector(stream.context, geometry, grid)
     whole = cl_array.zeros(stream.queue, made.shape, np.float32)
     project(stream.queue, whole, cl_array.to_device(stream.queue, values)).wait()
-    assert np.abs(made[3:VIEWS] - whole.get()[3:]).max() < SAME * np.abs(values).max()
+    expected = whole.get()
+    assert np.abs(made[3:VIEWS] - expected[3:]).max() < SAME * expected.max()
+    expected = 2 * measured[0:VIEWS] - expected
+    assert np.abs(more[0:VIEWS] - expected).max() < SAME * expected.max()
