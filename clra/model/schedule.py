@@ -19,8 +19,8 @@ _EXPECTED = (
 # "auto" begins at an eighth of the resolution where the panel's shorter side keeps this many
 # pixels. A fixed number of iterations does: they cost next to nothing there, and slow modes
 # (magnification and v that drift together along the scan) need them. By the paper's count, an
-# eighth 1/64 and a quarter 1/16 of an iteration, one more at each of the two for what displaces
-# their re-projections, it is 0.61: 2QR-2HR is 0.625.
+# eighth 1/64 and a quarter 1/16 of an iteration, two more at the one and one at the other for what
+# displaces their re-projections, it is 0.625, as 2QR-2HR.
 _SMALLEST = 48
 _LARGE = ((8, 6), (4, 3), (2, 1))
 
