@@ -15,7 +15,7 @@ import numpy as np
 
 import clra
 from clra.methods.fbp import ramp_fbp
-from clra.methods.refinement import refine
+from clra.methods.level import reprojections
 from clra.methods.reprojection import registration_for, reproject_and_register, with_margin
 from clra.model.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
@@ -53,13 +53,11 @@ def residuals(scan: clra.Scan, motion: clra.Motion) -> tuple[float, float]:
     stream = Stream()
     geometry = scan.geometry.with_motion(motion)
     radiographs = Radiographs(stream, scan, 1)
-    believed = np.ones(scan.views, dtype=bool)
     grid = with_margin(default_grid(scan.geometry))
-    volume = ramp_fbp(
-        stream, radiographs, geometry, grid, believed=believed, volumes=2, stage="reconstructing"
-    )
+    volume = ramp_fbp(stream, radiographs, geometry, grid, stage="reconstructing")
     left = [_left(stream, scan, radiographs, volume, motion)]
-    refine(stream, radiographs, volume, geometry, believed=believed, stage="reconstructing")
+    sharper = reprojections(stream, volume, geometry, 1, "re-projecting", lacking_of=radiographs)
+    volume = ramp_fbp(stream, sharper, geometry, grid, stage="reconstructing")
     left.append(_left(stream, scan, radiographs, volume, motion))
     return left[0], left[1]
 
