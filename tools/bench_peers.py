@@ -1,11 +1,12 @@
 """Other software's projectors on the work of :mod:`bench_cases`, for ``bench.py --peer``.
 
-A peer's methods take what clra's operators take, in numpy arrays and for ideal circles and
-helices, and return a function that does the work once. What it returns is comparable with clra's,
-where it returns something.
+A peer's methods take what clra's operators take, in numpy arrays (LEAP's for ideal circles and
+helices alone), and return a function that does the work once. What it returns is comparable with
+clra's, where it returns something.
 """
 
 import os
+import tempfile
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra import ConeBeamGeometry, VolumeGrid
+from clra.io.geometries import write_rtk_geometry
 
 Floats = NDArray[np.float32]
 Run = Callable[[], Any]
@@ -99,18 +101,13 @@ class Rtk:
         return run
 
     def _geometry(self, geometry: ConeBeamGeometry) -> Any:
-        orbit = self._rtk.ThreeDCircularProjectionGeometry.New()
-        angles = np.degrees(np.arctan2(geometry.source[:, 0], -geometry.source[:, 1]))
-        for angle, height, near, far in zip(
-            angles,
-            geometry.source[:, 2],
-            geometry.source_to_axis,
-            geometry.source_to_detector,
-            strict=True,
-        ):
-            numbers = (near, far, angle, 0.0, height, 0.0, 0.0, 0.0, height)
-            orbit.AddProjection(*map(float, numbers))
-        return orbit
+        # Through its file, which knows any rectangular panel.
+        with tempfile.NamedTemporaryFile(suffix=".xml") as file:
+            write_rtk_geometry(file.name, geometry)
+            reader = self._rtk.ThreeDCircularProjectionGeometryXMLFileReader.New()
+            reader.SetFilename(file.name)
+            reader.GenerateOutputInformation()
+            return reader.GetOutputObject()
 
     def _projections(self, geometry: ConeBeamGeometry, projections: Floats) -> Any:
         pitch = [float(np.linalg.norm(step[0])) for step in (geometry.u, geometry.v)]

@@ -207,6 +207,26 @@ def simulated_scan(
     return Scan(radiographs, geometry, name=name, truth=motion)
 
 
+def counted(
+    image: NDArray[np.float32], photons: float, *, seed: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Return line integrals as they are measured by counting photons.
+
+    Parameters
+    ----------
+    image : ndarray, (rows, columns)
+        Line integrals.
+    photons : float
+        Expected in a pixel of the open beam.
+    seed : (int, int)
+        Of the random numbers: of the scan, and the view.
+    """
+    random = np.random.default_rng(seed)
+    counts = random.poisson(photons * np.exp(-image.astype(np.float64)))
+    # A pixel that no photon reached is taken for half of one, as its logarithm must be.
+    return np.log(photons / np.maximum(counts, 0.5)).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class _Simulated:
     """Line integrals (views, rows, columns), computed as they are sliced."""
@@ -225,8 +245,5 @@ class _Simulated:
         images = self.phantom.line_integrals(self.geometry, start, stop)
         if self.noise is not None:
             for view, image in enumerate(images, start):
-                random = np.random.default_rng([self.seed, view])
-                photons = random.poisson(self.noise * np.exp(-image.astype(np.float64)))
-                # A pixel that no photon reached is taken for half of one, as its logarithm must be.
-                image[...] = np.log(self.noise / np.maximum(photons, 0.5))
+                image[...] = counted(image, self.noise, seed=(self.seed, view))
         return images

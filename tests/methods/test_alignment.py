@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import clra
+from clra.app.simulate import counted
 from clra.methods.alignment import AlignmentInterrupted
 from clra.model.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
@@ -61,6 +62,20 @@ def test_motion_is_found(moved, result):
     # Panels of 128 columns hardly tell magnifications of 0.1 %: what counts is no drift of it.
     assert error.mae_m < 1e-3
     assert np.mean(np.log(result.motion.magnification)) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("photons", [1e4, 100])
+def test_counted_photons_hardly_harm(moved, photons):
+    # Line integrals reach 3.9: where the rock is thickest, 2 of 100 photons come through.
+    pixels = [
+        counted(image, photons, seed=(3, view)) for view, image in enumerate(moved.read(0, VIEWS))
+    ]
+    noisy = clra.Scan(np.array(pixels), moved.geometry)
+    points = sample_points(default_grid(moved.geometry))
+    error = motion_error(clra.align(noisy).motion, moved.truth, moved.geometry, points)
+    assert error.mae_u < 0.15
+    assert error.mae_v < 0.25
+    assert error.mae_m < 1e-3
 
 
 def test_history_tells_each_iteration(result):
