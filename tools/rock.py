@@ -6,9 +6,10 @@ scale and magnifications of 1 +- 0.002, of
 
 - the stack of spheres in closed form, as ``reproduce_figure3.py`` makes it;
 - a Berea sandstone, DATA/rock/berea_200.npz: its 200^3 voxels, mirrored, fill the cylinder of the
-  paper's phantom, one to one of the paper's voxels. itk-rtk projects them (Joseph) from where
-  source and panel really stood, by rays two voxels apart, whose transmissions are averaged over a
-  pixel. Alignment itself reconstructs at half of a panel that has 1 / scale of the paper's pixels.
+  paper's phantom, one to one of the paper's voxels. Averaged to voxels of half a pixel, they are
+  projected by itk-rtk (Joseph) from where source and panel really stood; at a quarter of the size
+  by 2 x 2 rays a pixel, whose transmissions are averaged. Alignment itself reconstructs from at
+  most half of the panel's resolution, with voxels four times as large.
 
 The open beam has 10 000 photons a pixel; line integrals reach 2 and 2.7. Photons are counted as
 the radiographs are read, with random numbers of the view, so that nothing is written twice: FOLDER
@@ -29,12 +30,13 @@ from typing import Any
 import numpy as np
 from bench_peers import Rtk
 from numpy.typing import NDArray
-from reproduce_figure3 import HEAD, MOTIONS, SETS, VOXEL, geometry_of, moved_scan, row, surfaces
-from reproduce_figure3 import SAMPLE as SIZE
+from paper_sets import MOTIONS, SETS, SHIFT, VOXEL, geometry_of, moved_scan, surfaces
+from paper_sets import SAMPLE as SIZE
+from reproduce_figure3 import HEAD, row
 
 import clra
 from clra.app.simulate import counted
-from clra.model.gauge import motion_error, sample_points, without_gauge
+from clra.model.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.scan import Projections
 
@@ -67,17 +69,18 @@ class Counted:
         return images
 
 
-def berea() -> NDArray[np.bool_]:
-    """Return where the grains are, (z, y, x) on `GRID`."""
+def berea(factor: int) -> NDArray[np.float32]:
+    """Return the part of each voxel that is grain, (z, y, x) on `GRID` binned."""
     path = Path(os.environ.get("CLRA_TEST_DATA", "")) / "rock" / "berea_200.npz"
     if not path.is_file():
         sys.exit(f"CLRA_TEST_DATA: found no {path}, expected a folder that holds rock/{path.name}")
     grains = ~np.load(path)["im"]
-    more = [(0, max(0, n - m)) for n, m in zip(GRID.shape, grains.shape, strict=True)]
+    more = [(0, n - m) for n, m in zip(GRID.shape, grains.shape, strict=True)]
     grains = np.pad(grains, more, mode="symmetric")
     x, y, _ = GRID.coordinates()
     grains &= np.hypot(x, y[:, None]) < 0.5 * FILLED * SIZE[1] * VOXEL
-    return grains
+    sizes = [part for n in GRID.shape for part in (n // factor, factor)]
+    return grains.reshape(sizes).mean(axis=(1, 3, 5), dtype=np.float32)
 
 
 def split(geometry: clra.ConeBeamGeometry, motion: clra.Motion, parts: int) -> Any:
@@ -98,14 +101,14 @@ def split(geometry: clra.ConeBeamGeometry, motion: clra.Motion, parts: int) -> A
 def project(geometry: clra.ConeBeamGeometry, motion: clra.Motion, scale: int, path: Path) -> None:
     """Write the rock's radiographs, line integrals without noise; the file appears whole."""
     parts = scale // 2
-    fine, grains, projector = split(geometry, motion, parts), berea(), Rtk()
+    fine, grains, projector = split(geometry, motion, parts), berea(parts), Rtk()
     partial = path.with_suffix(".partial")
     shape = (geometry.views, *geometry.shape)
     images = np.lib.format.open_memmap(partial, "w+", np.float32, shape)
     for start in range(0, geometry.views, CHUNK):
         print(f"{path.stem}: projecting view {start} of {geometry.views}", file=sys.stderr)
         chosen = slice(start, start + CHUNK)
-        lengths = projector.forward(fine.subset(chosen), GRID, grains)()()
+        lengths = projector.forward(fine.subset(chosen), GRID.binned(parts), grains)()()
         transmitted = np.exp(-ATTENUATION * lengths)
         blocks = transmitted.reshape(-1, geometry.rows, parts, geometry.columns, parts)
         images[chosen] = -np.log(blocks.mean(axis=(2, 4)))
@@ -116,7 +119,7 @@ def project(geometry: clra.ConeBeamGeometry, motion: clra.Motion, scale: int, pa
 def rock_scan(trajectory: str, motion: str, scale: int, folder: Path) -> clra.Scan:
     """Return a moved scan of the rock, its radiographs on disk."""
     geometry = geometry_of(trajectory, scale)
-    span = (-10 / scale, 8 / scale)
+    span = SHIFT[0] / scale, SHIFT[1] / scale
     drawn = MOTIONS[motion](geometry.views, seed=1, shift=span, magnification=SPREAD)
     clouds = [sample_points(default_grid(geometry)), sample_points(GRID, seed=1)]
     truth = without_gauge(drawn, geometry, clouds)
@@ -136,7 +139,7 @@ def run(sample: str, trajectory: str, motion: str, scale: int, folder: Path) -> 
     started = time.perf_counter()
     found = clra.align(noisy).motion
     seconds = time.perf_counter() - started
-    error = motion_error(found, scan.truth, scan.geometry, points, magnification=False)
+    error = Gauge(scan.geometry, points, magnification=False).error(found, scan.truth)
     return {**error.means(), "seconds": seconds}
 
 

@@ -72,7 +72,7 @@ def test_counted_photons_hardly_harm(moved, photons):
     ]
     noisy = clra.Scan(np.array(pixels), moved.geometry)
     points = sample_points(default_grid(moved.geometry))
-    error = motion_error(clra.align(noisy).motion, moved.truth, moved.geometry, points)
+    error = Gauge(moved.geometry, points).error(clra.align(noisy).motion, moved.truth)
     assert error.mae_u < 0.15
     assert error.mae_v < 0.25
     assert error.mae_m < 1e-3
