@@ -6,10 +6,10 @@ scale and magnifications of 1 +- 0.002, of
 
 - the stack of spheres in closed form, as ``reproduce_figure3.py`` makes it;
 - a Berea sandstone, DATA/rock/berea_200.npz: its 200^3 voxels, mirrored, fill the cylinder of the
-  paper's phantom, one to one of the paper's voxels. Averaged to voxels of half a pixel, they are
-  projected by itk-rtk (Joseph) from where source and panel really stood; at a quarter of the size
-  by 2 x 2 rays a pixel, whose transmissions are averaged. Alignment itself reconstructs from at
-  most half of the panel's resolution, with voxels four times as large.
+  paper's phantom, as large as half a pixel seen at the axis, whatever the scale: grains of about 14
+  pixels. itk-rtk projects them (Joseph) from where source and panel really stood; at a quarter of
+  the size by 2 x 2 rays a pixel, whose transmissions are averaged. Alignment itself reconstructs
+  from at most half of the panel's resolution, with voxels four times as large.
 
 The open beam has 10 000 photons a pixel; line integrals reach 2 and 2.7. Photons are counted as
 the radiographs are read, with random numbers of the view, so that nothing is written twice: FOLDER
@@ -42,10 +42,9 @@ from clra.model.scan import Projections
 
 SAMPLES = ("spheres", "berea")
 PHOTONS, SPREAD = 1e4, 0.002
-GRID = VolumeGrid(shape=(SIZE[0], SIZE[1], SIZE[1]), voxel_size=VOXEL)  # of the rock
-# The cylinder's part of the grid's radius, as the spheres': shifted by 10 pixels it is not cut off.
-FILLED = 0.97
-ATTENUATION = 2.5 / (FILLED * SIZE[1] * VOXEL)  # of the grains: 2.5 through the axis without pores
+# The spheres' too: shifted by 10 pixels it is not cut off.
+RADIUS = 0.97 * SIZE[1] / 2 * VOXEL
+ATTENUATION = 2.5 / (2 * RADIUS)  # of the grains: 2.5 through the axis without pores
 CHUNK = 216  # views that itk-rtk projects at a time
 
 
@@ -69,18 +68,23 @@ class Counted:
         return images
 
 
-def berea(factor: int) -> NDArray[np.float32]:
-    """Return the part of each voxel that is grain, (z, y, x) on `GRID` binned."""
+def cylinder(scale: int) -> VolumeGrid:
+    """Return the grid of the rock: of the size of the paper's phantom, voxels of half a pixel."""
+    planes, columns = (2 * n // scale for n in SIZE)
+    return VolumeGrid(shape=(planes, columns, columns), voxel_size=VOXEL * scale / 2)
+
+
+def berea(grid: VolumeGrid) -> NDArray[np.bool_]:
+    """Return where the grains are, (z, y, x)."""
     path = Path(os.environ.get("CLRA_TEST_DATA", "")) / "rock" / "berea_200.npz"
     if not path.is_file():
         sys.exit(f"CLRA_TEST_DATA: found no {path}, expected a folder that holds rock/{path.name}")
     grains = ~np.load(path)["im"]
-    more = [(0, n - m) for n, m in zip(GRID.shape, grains.shape, strict=True)]
+    more = [(0, n - m) for n, m in zip(grid.shape, grains.shape, strict=True)]
     grains = np.pad(grains, more, mode="symmetric")
-    x, y, _ = GRID.coordinates()
-    grains &= np.hypot(x, y[:, None]) < 0.5 * FILLED * SIZE[1] * VOXEL
-    sizes = [part for n in GRID.shape for part in (n // factor, factor)]
-    return grains.reshape(sizes).mean(axis=(1, 3, 5), dtype=np.float32)
+    x, y, _ = grid.coordinates()
+    grains &= np.hypot(x, y[:, None]) < RADIUS
+    return grains
 
 
 def split(geometry: clra.ConeBeamGeometry, motion: clra.Motion, parts: int) -> Any:
@@ -100,15 +104,15 @@ def split(geometry: clra.ConeBeamGeometry, motion: clra.Motion, parts: int) -> A
 
 def project(geometry: clra.ConeBeamGeometry, motion: clra.Motion, scale: int, path: Path) -> None:
     """Write the rock's radiographs, line integrals without noise; the file appears whole."""
-    parts = scale // 2
-    fine, grains, projector = split(geometry, motion, parts), berea(parts), Rtk()
+    parts, grid = scale // 2, cylinder(scale)
+    fine, grains, projector = split(geometry, motion, parts), berea(grid), Rtk()
     partial = path.with_suffix(".partial")
     shape = (geometry.views, *geometry.shape)
     images = np.lib.format.open_memmap(partial, "w+", np.float32, shape)
     for start in range(0, geometry.views, CHUNK):
         print(f"{path.stem}: projecting view {start} of {geometry.views}", file=sys.stderr)
         chosen = slice(start, start + CHUNK)
-        lengths = projector.forward(fine.subset(chosen), GRID.binned(parts), grains)()()
+        lengths = projector.forward(fine.subset(chosen), grid, grains)()()
         transmitted = np.exp(-ATTENUATION * lengths)
         blocks = transmitted.reshape(-1, geometry.rows, parts, geometry.columns, parts)
         images[chosen] = -np.log(blocks.mean(axis=(2, 4)))
@@ -121,7 +125,7 @@ def rock_scan(trajectory: str, motion: str, scale: int, folder: Path) -> clra.Sc
     geometry = geometry_of(trajectory, scale)
     span = SHIFT[0] / scale, SHIFT[1] / scale
     drawn = MOTIONS[motion](geometry.views, seed=1, shift=span, magnification=SPREAD)
-    clouds = [sample_points(default_grid(geometry)), sample_points(GRID, seed=1)]
+    clouds = [sample_points(default_grid(geometry)), sample_points(cylinder(scale), seed=1)]
     truth = without_gauge(drawn, geometry, clouds)
     path = folder / f"berea-{trajectory}-{motion}-{scale}-{SPREAD:g}.npy"
     if not path.exists():
@@ -134,7 +138,7 @@ def run(sample: str, trajectory: str, motion: str, scale: int, folder: Path) -> 
     if sample == "spheres":
         scan, points = moved_scan(trajectory, motion, scale, SPREAD, folder), surfaces()
     else:
-        scan, points = rock_scan(trajectory, motion, scale, folder), sample_points(GRID)
+        scan, points = rock_scan(trajectory, motion, scale, folder), sample_points(cylinder(scale))
     noisy = clra.Scan(Counted(scan.projections), scan.geometry, name=scan.name, truth=scan.truth)
     started = time.perf_counter()
     found = clra.align(noisy).motion

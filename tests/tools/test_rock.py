@@ -60,13 +60,14 @@ def test_photons_are_those_of_the_view(rock):
 
 def test_rock_fills_the_cylinder(rock, data, monkeypatch):
     monkeypatch.setenv("CLRA_TEST_DATA", str(data))
-    grains = 8 * rock.berea(2)
-    assert grains.shape == rock.GRID.binned(2).shape
+    grid = rock.cylinder(4)
+    grains = rock.berea(grid)
+    assert grains.shape == grid.shape == (624, 240, 240)
     # A fifth of the sandstone is pores.
-    assert grains.sum() / (np.pi / 4 * (rock.FILLED * 480) ** 2 * 1248) == pytest.approx(0.8, 0.02)
+    assert grains.sum() / (np.pi * (0.97 * 120) ** 2 * 624) == pytest.approx(0.8, abs=0.02)
 
 
 def test_data_that_are_not_there(rock, monkeypatch, tmp_path):
     monkeypatch.setenv("CLRA_TEST_DATA", str(tmp_path))
     with pytest.raises(SystemExit, match=r"found no .*berea_200\.npz, expected a folder"):
-        rock.berea(1)
+        rock.berea(rock.cylinder(4))
