@@ -68,7 +68,7 @@ def align(
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
         panel of 384 pixels and more "6ER-3QR-1HR", else a quarter of the resolution until converged
-        (at most 6 iterations), then one iteration at half. For "imgr" the
+        (at most 6 iterations), then half (at most 3). For "imgr" the
         levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
@@ -267,7 +267,8 @@ class _Run:
             # 6, 13: until converged
             if stage.iterations is None and converged(update_u, update_v, previous):
                 break
-            previous = update_size(update_u, update_v)[0]
+            # The first of all finds too little, see `_move`: the second may well find as much.
+            previous = None if len(self.history) == 1 else update_size(update_u, update_v)[0]
         if len({entry.level for entry in self.history}) == 1:
             warn_of_lost_features(self.scan, found.correlation, stage.level, name)
 

@@ -25,8 +25,9 @@ _SMALLEST = 48
 _LARGE = ((8, 6), (4, 3), (2, 1))
 
 # Iterations after which "until converged" gives up: plain re-projection alignment of a slow, smooth
-# motion gains less than a tenth of its error in each further one.
-_LIMIT = 6
+# motion gains less than a tenth of its error in each further one. Three at half the resolution:
+# spheres need one, a sandstone whose grains are 4 pixels wide at a quarter needs two or three.
+_LIMIT, _LIMIT_AT_HALF = 6, 3
 
 # Median and largest shift update that count as converged [pixel of the full-resolution panel]: the
 # paper's best results are 0.25 pixel from the truth, so a tenth more changes nothing visible.
@@ -106,8 +107,8 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
     ----------
     text : str
         Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto": "6ER-3QR-1HR" for
-        large panels, for others quarter resolution until converged (at most 6 iterations), then one
-        iteration at half resolution.
+        large panels, for others quarter resolution until converged (at most 6 iterations), then
+        half (at most 3).
     shape : (int, int)
         Rows and columns of the panel, for "auto": large is from 384 on.
 
@@ -124,7 +125,7 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
     if text == "auto":
         if min(shape) // 8 >= _SMALLEST:
             return tuple(Stage(level, count, count) for level, count in _LARGE)
-        return Stage(_LEVELS["QR"], None, _LIMIT), Stage(_LEVELS["HR"], 1, 1)
+        return Stage(_LEVELS["QR"], None, _LIMIT), Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF)
     stages = []
     for part in str(text).upper().split("-"):
         match = _STAGE.fullmatch(part)

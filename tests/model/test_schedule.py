@@ -13,7 +13,7 @@ from clra.model.schedule import Stage, converged, level_name, parse_schedule, up
         ("2qr-12hr", [(4, 2, 2), (2, 12, 12)]),
         ("4FR", [(1, 4, 4)]),
         ("2ER-1QR-1HR-3FR", [(8, 2, 2), (4, 1, 1), (2, 1, 1), (1, 3, 3)]),
-        ("auto", [(4, None, 6), (2, 1, 1)]),
+        ("auto", [(4, None, 6), (2, None, 3)]),
     ],
 )
 def test_text_becomes_stages(text, stages):
@@ -37,7 +37,7 @@ def test_bad_text_says_what_a_schedule_looks_like(text):
 
 def test_stages_print_as_they_are_written():
     assert "-".join(str(stage) for stage in parse_schedule("2ER-1QR-3FR")) == "2ER-1QR-3FR"
-    assert [str(stage) for stage in parse_schedule("auto")] == ["QR", "1HR"]
+    assert [str(stage) for stage in parse_schedule("auto")] == ["QR", "HR"]
     assert [level_name(level) for level in (1, 2, 4, 8)] == ["FR", "HR", "QR", "ER"]
     with pytest.raises(ValueError, match="level: found 3"):
         level_name(3)
