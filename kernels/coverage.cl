@@ -1,8 +1,9 @@
 // Views that see a voxel, W, on a coarse grid; and a volume divided by it.
 //
 // W(x) = sum over views of the view's weight times that of the row that x falls on, linear between
-// rows, 0 for a view on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It varies over many
-// voxels, so that it is computed once for a block of them and interpolated linearly.
+// rows, 0 for a view on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It
+// varies over many voxels, so that it is computed once for a block of them and interpolated
+// linearly.
 //
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
 // normalise one a voxel, along the volume's axes from last to first.

@@ -23,7 +23,7 @@ VIEWS, VOXEL, SAMPLE = 3456, 0.004544, (1248, 480)  # planes and columns of the 
 SPHERES = three_spheres(SAMPLE[1] / 2 * VOXEL, SAMPLE[0] * VOXEL)
 MOTIONS = {"random": random_motion, "smooth": smooth_motion}
 SETS = [(t, m) for t in ("helix", "space-filling") for m in MOTIONS]
-SHIFT = -10.0, 8.0  # pixels
+SHIFT = -10.0, 8.0  # pixels, of whatever panel
 
 
 def geometry_of(trajectory: str, scale: int) -> clra.ConeBeamGeometry:
@@ -49,11 +49,10 @@ def surfaces(count: int = 1500) -> NDArray[np.float64]:
 
 
 def true_motion(
-    geometry: clra.ConeBeamGeometry, motion: str, scale: int, magnification: float, seed: int
+    geometry: clra.ConeBeamGeometry, motion: str, magnification: float, seed: int
 ) -> Motion:
     """Draw a motion, and take out what a movement of the sample would explain."""
-    span = SHIFT[0] / scale, SHIFT[1] / scale
-    drawn = MOTIONS[motion](geometry.views, seed=seed, shift=span, magnification=magnification)
+    drawn = MOTIONS[motion](geometry.views, seed=seed, shift=SHIFT, magnification=magnification)
     clouds = [sample_points(default_grid(geometry)), surfaces()]
     return without_gauge(drawn, geometry, clouds, magnification > 0)
 
@@ -63,7 +62,7 @@ def moved_scan(
 ) -> clra.Scan:
     """Return one of the sets, its radiographs on disk."""
     geometry = geometry_of(trajectory, scale)
-    truth = true_motion(geometry, motion, scale, magnification, seed)
+    truth = true_motion(geometry, motion, magnification, seed)
     name = f"{trajectory}-{motion}-{scale}-{magnification:g}" + f"-{seed}" * (seed != 1)
     path = folder / f"{name}.npy"
     if not path.exists():
