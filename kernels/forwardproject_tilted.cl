@@ -84,8 +84,10 @@ static inline void add_planes(
                 const real left = SMALLER(q, end_q), right = LARGER(q, end_q);
                 const real bottom = SMALLER(z, end_z), top = LARGER(z, end_z);
                 const whole low = to_whole(LARGER(left, (real)(0.0f))) - 1;
-                const whole crossings =
+                // none, and not -1, where rounding takes the rays past the last line's neighbour
+                const whole beyond_low =
                     to_whole(SMALLER(right, (real)(across + 0.5f))) - (low + 1);
+                const whole crossings = LARGER(beyond_low, (whole)(0));
                 const whole base = to_whole(bottom) - PAD;
                 const whole ragged = (left < 1.0f) | (right >= (float)across) |
                                      (bottom < (float)PAD) | (top >= s.nz - 1.0f + PAD) |

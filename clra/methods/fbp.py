@@ -112,7 +112,8 @@ def ramp_fbp(
                 # One chunk is read while another is worked on; none may be let go before.
                 busy.append((event, (measured, filtered)))
                 if len(busy) > 1:
-                    busy.pop(0)[0].wait()
+                    busy[0][0].wait()
+                    del busy[0]
                 del measured, filtered
                 done += views.stop - views.start
         first = wanted.start - near.start + volume.planes[index].start

@@ -113,7 +113,8 @@ def katsevich(
                     # before.
                     busy.append((event, (measured, filtered)))
                     if len(busy) > 1:
-                        busy.pop(0)[0].wait()
+                        busy[0][0].wait()
+                        del busy[0]
                     del measured, filtered
                     done += count
             stream.queue.finish()

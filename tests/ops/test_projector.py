@@ -4,7 +4,9 @@ import itertools
 import math
 
 import numpy as np
+import pyopencl.array as cl_array
 import pytest
+from arrays import with_offset
 from geometries import upside_down
 from projector_cases import (
     FORMS,
@@ -148,6 +150,29 @@ def test_adjoint_by_inner_products(queue, name, form):
     left = np.vdot(forward(queue, geometry, grid, volume, **form), projections)
     right = np.vdot(volume, back(queue, geometry, grid, projections, matched=True, **form))
     assert abs(left - right) < ADJOINT * left
+
+
+@all_forms
+@pytest.mark.parametrize("roll", [-7.0, 0.0, 7.0])
+def test_rays_along_the_very_edge_read_nothing_beyond_the_volume(queue, roll, form):
+    """A ray on the line beside the last one counts for nothing; rounding may take it farther."""
+    geometry = turned(
+        circular(1, start=1.8, **PANEL | {"shape": (37, 9), "pixel_size": 1.1}), roll, 0
+    )
+    shape, size = (40, 60, 60), 0.6
+    values = with_offset(queue, numbers(60, 60, 40), skip=4096)
+    sums = cl_array.empty(queue, (1, *geometry.shape), np.float32)
+    rows = np.arange(geometry.rows)
+    pixels = geometry.detector + np.outer(rows - 18, geometry.v)  # of the middle column
+    ways = pixels - geometry.source
+    at = (21 - 29.5) * size - geometry.source[0, 0]  # a plane of voxels; rays run along x
+    beside = geometry.source[0, 1] + ways[:, 1] / ways[:, 0] * at
+    for row, offset in itertools.product(rows, (-3e-6, -1e-6, 0.0, 1e-6)):
+        aside = beside[row] - (30.5 + offset) * size  # the last line is 29.5 from the middle
+        grid = VolumeGrid(shape=shape, voxel_size=size, centre=(0, aside, 0))
+        project = ForwardProjector(queue.context, geometry, grid, volume_order="yxz", **form)
+        project(queue, sums, values)
+        assert np.isfinite(sums.get()).all(), (row, offset)
 
 
 @forms
