@@ -1,15 +1,17 @@
 """Noise and texture: the paper's scans with counted photons, of its spheres and of a sandstone.
 
 ``CLRA_TEST_DATA=DATA python tools/rock.py --scale 4 -o FOLDER`` aligns eight scans at a quarter of
-the paper's size: {helix, space-filling} x {random, smooth} motions of -10 to 8 pixels over the
-scale and magnifications of 1 +- 0.002, of
+the paper's size: {helix, space-filling} x {random, smooth} motions and magnifications of 1 +- 0.002
+of
 
-- the stack of spheres in closed form, as ``reproduce_figure3.py`` makes it;
+- the stack of spheres in closed form, as ``reproduce_figure3.py`` makes it, moved by up to 10
+  pixels;
 - a Berea sandstone, DATA/rock/berea_200.npz: its 200^3 voxels, mirrored, fill the cylinder of the
   paper's phantom, as large as half a pixel seen at the axis, whatever the scale: grains of about 14
   pixels. itk-rtk projects them (Joseph) from where source and panel really stood; at a quarter of
   the size by 2 x 2 rays a pixel, whose transmissions are averaged. Alignment itself reconstructs
-  from at most half of the panel's resolution, with voxels four times as large.
+  from at most half of the panel's resolution, with voxels four times as large. The motion is of -10
+  to 8 pixels over the scale.
 
 The open beam has 10 000 photons a pixel; line integrals reach 2 and 2.7. Photons are counted as
 the radiographs are read, with random numbers of the view, so that nothing is written twice: FOLDER
