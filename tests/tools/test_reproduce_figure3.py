@@ -41,11 +41,13 @@ def test_every_scan_is_aligned_by_both_estimators_and_kept(folder):
     runs = runs_in(folder)
     for trajectory in ("helix", "space-filling"):
         for motion in ("random", "smooth"):
+            errors = {}
             for who in ("ours", "paper"):
                 found = runs[f"16 {trajectory} {motion} {who} 1HR"]
                 assert [step["level"] for step in found["iterations"]] == ["HR"]
-                # Motions are of -0.625 to 0.5 pixel; the mean of a uniform one is 0.28.
-                assert 0 < found["gauge_free_u"] < 0.28
+                errors[who] = found["gauge_free_u"]
+            # A third of this panel's width is far for one iteration: motions are 4.5 pixels.
+            assert 0 < errors["ours"] < errors["paper"] < 5
     assert len(runs) == 8
 
 
