@@ -28,14 +28,14 @@ from clra.methods.solver import Solver
 SCHEDULES = ("4FR", "1QR-1HR", "2QR-2HR", "auto")
 ABLATION: dict[str, dict[str, Any]] = {
     "everything": {},
-    "phase correlation": {"estimator": "phase-correlation"},
-    "no Anderson": {"memory": 0},
+    "phase correlation": {"solver": Solver(estimator="phase-correlation")},
+    "no Anderson": {"solver": Solver(memory=0)},
     "gauge not anchored": {"gauge": "free"},
-    "no circle": {"circle": False},
-    "bias left in": {"unbias": False},
-    "magnification from the start": {"shifts_first": False},
-    "no prior": {"spread": 0.0},
-    "prior 1e-3": {"spread": 1e-3},
+    "no circle": {"solver": Solver(circle=False)},
+    "bias left in": {"solver": Solver(unbias=False)},
+    "magnification from the start": {"solver": Solver(shifts_first=False)},
+    "no prior": {"solver": Solver(spread=0.0)},
+    "prior 1e-3": {"solver": Solver(spread=1e-3)},
 }
 HEAD = (
     "| run | raw u | raw v | gauge-free u | gauge-free v | magnification | time |\n"
@@ -45,12 +45,8 @@ HEAD = (
 
 def run(scan: clra.Scan, schedule: str, estimate: str, options: dict[str, Any]) -> dict[str, Any]:
     """Align once; errors after each iteration and at the end."""
-    gauge = options.get("gauge", "anchored")
-    parts = {name: value for name, value in options.items() if name != "gauge"}
     started = time.perf_counter()
-    result = clra.align(
-        scan, schedule=schedule, estimate=estimate, gauge=gauge, solver=Solver(**parts)
-    )
+    result = clra.align(scan, schedule=schedule, estimate=estimate, **options)
     keys = ("level", "mae_u", "mae_v", "gauge_free_u", "gauge_free_v")
     return {
         "iterations": [{key: getattr(step, key) for key in keys} for step in result.history],
@@ -97,8 +93,7 @@ def main() -> None:
         scan = scan_of(trajectory, motion, 0.0)
         for schedule in options.schedules.split(","):
             if options.estimator != "ours" and schedule != "auto":
-                paper = {"estimator": "phase-correlation", "memory": 0, "unbias": False}
-                paper |= {"circle": False, "gauge": "free"}
+                paper = {"solver": Solver.paper(), "gauge": "free"}
                 ensure(f"{name} paper {schedule}", scan, schedule, "shift", paper)
             if options.estimator != "paper":
                 ensure(f"{name} ours {schedule}", scan, schedule, "shift", {})

@@ -17,6 +17,7 @@ from clra.io.errors import InputError, OutputError
 from clra.io.motions import read_motion_file
 from clra.io.scans import scan_checksum
 from clra.methods.autofocus import Focus
+from clra.methods.outliers import all_but
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 
@@ -70,7 +71,7 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, 
     """
     file = read_motion_file(path)
     _check(scan, file.motion, file.attributes.get("checksum", ""), path)
-    believed = ~np.isin(np.arange(scan.views), file.flagged)
+    believed = all_but(file.flagged, scan.views)
     return focused(scan, file.attributes, path), file.motion, believed
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clra.app.describe import path_of
 from clra.io.motions import MotionFile, read_motion_file, write_motion_file
 from clra.io.scans import scan_checksum
+from clra.methods.outliers import all_but
 from clra.methods.results import AlignmentResult, Iteration
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -53,7 +54,7 @@ class Record:
     @property
     def believed(self) -> NDArray[np.bool_]:
         """Views but for the flagged ones, (views,)."""
-        return ~np.isin(np.arange(self.motion.views), self.flagged)
+        return all_but(self.flagged, self.motion.views)
 
     @property
     def scale_estimated(self) -> bool:

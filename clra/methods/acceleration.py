@@ -117,7 +117,7 @@ class MotionSteps:
         return motion.normalised(), (end - start)[:2]
 
     def restart(self) -> None:
-        """Forget the steps so far: those of another level."""
+        """Go on at another level, see :meth:`Anderson.restart`."""
         self._anderson.restart()
 
     def _as_lengths(self, motion: Motion) -> Floats:

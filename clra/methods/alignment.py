@@ -156,7 +156,6 @@ def align(
             )
             return _on_panel(solved, whole)
         run = _Run(stream, scan, with_margin(grid), schedule, scale, solver, start)
-        run.several = stages != (Stage(stages[0].level, 1, 1),)
         run.truth = truth
         run.align(stages)
     except AlignmentInterrupted as stopped:
@@ -203,7 +202,7 @@ class _Run:
     scale: bool
     solver: Solver
     start: Motion
-    several: bool = field(init=False, default=True)  # iterations in the schedule
+    several: bool = field(init=False)  # iterations in the schedule
     motion: Motion = field(init=False)
     truth: Motion | None = field(init=False, default=None)
     history: list[Iteration] = field(init=False, default_factory=list)
@@ -223,6 +222,7 @@ class _Run:
 
     def align(self, stages: Sequence[Stage]) -> None:
         """Go through the levels; what an interruption leaves is kept."""
+        self.several = sum(stage.limit for stage in stages) > 1
         try:
             for stage in stages:
                 self.align_level(stage)

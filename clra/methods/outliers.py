@@ -1,5 +1,7 @@
 """Views that are not believed: blank, saturated, or not of this sample."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
@@ -80,6 +82,13 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
     spread = 1.4826 * np.median(np.abs(correlation - middle))
     least = min(_LEAST, _LACK * (1 - middle))
     return np.asarray(correlation < middle - max(_DEVIATIONS * spread, least))
+
+
+def all_but(flagged: Sequence[int], views: int) -> NDArray[np.bool_]:
+    """Return which of the views are believed, (views,): all but the flagged ones."""
+    believed = np.ones(views, np.bool_)
+    believed[list(flagged)] = False
+    return believed
 
 
 def handed_on(source: Floats, believed: NDArray[np.bool_]) -> Floats:

@@ -11,6 +11,7 @@ from clra.methods.alignment import align as align_scan
 from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
 from clra.methods.katsevich import Exact, exact_helices, katsevich
+from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -158,7 +159,7 @@ def reconstruct_into(
     if align and method != "imgr":
         aligned = align_scan(scan, device=devices[0], progress=progress, **limits)
         motion = aligned.motion
-        believed = ~np.isin(np.arange(scan.views), aligned.flagged)
+        believed = all_but(aligned.flagged, scan.views)
     if method == "katsevich" and believed is not None and not believed.all():
         warnings.warn(
             f"katsevich needs every view: {(~believed).sum()} that are not believed are used, too",

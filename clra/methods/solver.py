@@ -35,9 +35,10 @@ class Solver:
         :class:`clra.ops.registration.Registration`, or the paper's: the peak of the phase
         correlation, refined by a parabola, which finds shifts only.
     memory : int
-        Iterations that Anderson acceleration looks back on within a level; 0 for plain steps.
+        Steps from one iteration to the next that Anderson acceleration looks back on, also of the
+        level before; 0 for plain steps.
     anchor : bool
-        Take the gauge out of the motion in each iteration.
+        Take the gauge out of the motion in each iteration; :func:`clra.align` sets it by `gauge`.
     circle : bool
         Reconstruct nothing outside the circle that all views see.
     unbias : bool

@@ -329,9 +329,6 @@ def check_pair(
     context: cl.Context, shape: tuple[int, int], measured: Array, simulated: Array
 ) -> int:
     """Return the number of pairs, after both arrays were found to be (n, rows, columns)."""
-    opencl.check_array("measured", measured, getattr(measured, "shape", ()), context=context)
-    n = int(measured.shape[0]) if measured.ndim else 0
-    if measured.shape != (n, *shape) or n < 1:
-        raise ValueError(f"measured: found shape {measured.shape}, expected (n, *{shape})")
+    n = opencl.check_images("measured", measured, shape, context)
     opencl.check_array("simulated", simulated, (n, *shape), context=context)
     return n

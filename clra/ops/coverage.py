@@ -11,10 +11,9 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops import opencl
-from clra.ops.filtering import view_weights
 from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
-from clra.ops.views import check_geometry
+from clra.ops.views import check_geometry, view_weights
 
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
 # rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a

@@ -14,7 +14,7 @@ from clra.ops.fft import RealFFT, fast_length
 from clra.ops.lines import lanes
 from clra.ops.scratch import Allocator, Scratch, within
 from clra.ops.steps import Step, to_device
-from clra.ops.views import check_geometry, successive
+from clra.ops.views import check_geometry, successive, view_weights
 
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
 
@@ -247,14 +247,6 @@ def _row_weights(row_weight: ArrayLike | None, rows: int) -> NDArray[np.float32]
     weights = np.ascontiguousarray(row_weight, np.float32)
     if weights.shape != (rows,) or not np.all(np.isfinite(weights)):
         raise ValueError(f"row_weight: found shape {weights.shape}, expected {rows} finite numbers")
-    return weights
-
-
-def view_weights(view_weight: ArrayLike | None, views: int) -> NDArray[np.float64]:
-    """Return weights of views as given, (views,); 1 by default."""
-    weights = np.ones(views) if view_weight is None else np.asarray(view_weight, np.float64)
-    if weights.shape != (views,) or not np.all(np.isfinite(weights)):
-        raise ValueError(f"view_weight: found {weights.shape}, expected {views} finite numbers")
     return weights
 
 

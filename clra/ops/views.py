@@ -1,4 +1,7 @@
-"""Which views an operator is called for, and whether a geometry is of the views it was made for."""
+"""Views that operators are made for and called for: their number, their order, their weights."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from clra.model.geometry import ConeBeamGeometry
 
@@ -42,3 +45,11 @@ def successive(views: slice | None, total: int) -> tuple[int, int]:
     if step != 1 or stop <= start:
         raise ValueError(f"views: found {views}, expected successive ones of {total}")
     return start, stop
+
+
+def view_weights(view_weight: ArrayLike | None, views: int) -> NDArray[np.float64]:
+    """Return weights of views as given, (views,); 1 by default."""
+    weights = np.ones(views) if view_weight is None else np.asarray(view_weight, np.float64)
+    if weights.shape != (views,) or not np.all(np.isfinite(weights)):
+        raise ValueError(f"view_weight: found {weights.shape}, expected {views} finite numbers")
+    return weights
