@@ -93,7 +93,7 @@ def align(
         and what the iteration finds of it comes from how a cone beam reconstructs the ends of a
         scan: it would go on and stretch the sample. "anchored" takes it out in each iteration.
     solver : Solver, optional
-        Parts of the iteration, to switch some off; `gauge` says whether it anchors.
+        Parts of the iteration, to switch some off.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 
@@ -137,7 +137,7 @@ def align(
             return _on_panel(drift, whole)
         motion = drift.motion
     grid = grid or default_grid(scan.geometry)
-    solver = replace(solver or Solver(), anchor=gauge == "anchored")
+    solver, anchor = solver or Solver(), gauge == "anchored"
     scale = estimate != "shift" and solver.estimator == "gauss-newton"
     start = motion or Motion.identity(scan.views)
     start = start.caused_by("source" if estimate == "source" else "panel")
@@ -150,12 +150,12 @@ def align(
                 levels=schedule,
                 align=True,
                 scale=scale,
-                anchor=solver.anchor,
+                anchor=anchor,
                 motion=start,
                 truth=truth,
             )
             return _on_panel(solved, whole)
-        run = _Run(stream, scan, with_margin(grid), schedule, scale, solver, start)
+        run = _Run(stream, scan, with_margin(grid), schedule, scale, anchor, solver, start)
         run.truth = truth
         run.align(stages)
     except AlignmentInterrupted as stopped:
@@ -200,6 +200,7 @@ class _Run:
     grid: VolumeGrid
     schedule: str
     scale: bool
+    anchor: bool
     solver: Solver
     start: Motion
     several: bool = field(init=False)  # iterations in the schedule
@@ -291,8 +292,7 @@ class _Run:
         self.registered = found
         self.weak = outliers(found.correlation)
         self.found = from_neighbours(self.motion.then(found.motion), self.weak).normalised()
-        anchored = self.shift_gauge.anchored(self.found, self.start)
-        there = anchored if self.solver.anchor else self.found
+        there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
         # The first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
         self.motion, step = self.steps.next(self.motion, there, plain=not self.history)

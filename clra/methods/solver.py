@@ -37,8 +37,6 @@ class Solver:
     memory : int
         Steps from one iteration to the next that Anderson acceleration looks back on, also of the
         level before; 0 for plain steps.
-    anchor : bool
-        Take the gauge out of the motion in each iteration; :func:`clra.align` sets it by `gauge`.
     circle : bool
         Reconstruct nothing outside the circle that all views see.
     unbias : bool
@@ -57,7 +55,6 @@ class Solver:
 
     estimator: str = "gauss-newton"
     memory: int = 3
-    anchor: bool = True
     circle: bool = True
     unbias: bool = True
     shifts_first: bool = True
@@ -69,11 +66,10 @@ class Solver:
 
     @classmethod
     def paper(cls) -> "Solver":
-        """Return Algorithm 1 as it is printed."""
+        """Return Algorithm 1 as it is printed, which leaves the gauge free, see `clra.align`."""
         return cls(
             estimator="phase-correlation",
             memory=0,
-            anchor=False,
             circle=False,
             unbias=False,
             shifts_first=False,
