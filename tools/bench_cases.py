@@ -9,7 +9,8 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,11 @@ import pyopencl as cl
 import pyopencl.array
 from bench_peers import Peer
 from numpy.typing import NDArray
+from paper_sets import SAMPLE, VOXEL, geometry_of, moved_scan, project
 
 import clra
 from clra.model.perturbation import random_motion
-from clra.model.phantom import Ellipsoids, porous, three_spheres
-from clra.model.trajectory import PAPER
+from clra.model.phantom import Ellipsoids, porous
 from clra.ops.filtering import RampFilter
 from clra.ops.registration import ESTIMATE_FIELDS, Registration
 
@@ -103,22 +104,11 @@ def circle(size: int = 256, views: int = 60, panel: int = 384) -> tuple[Any, Any
     return geometry, clra.VolumeGrid(shape=(size, size, size), voxel_size=voxel)
 
 
-def paper_helix(views: int, rows: int) -> tuple[Any, Any]:
-    """Geometry and grid of the paper's helix at a quarter of the resolution."""
-    sparse = 3456 // views
-    paper = dict(PAPER)
-    geometry = clra.helix(
-        views,
-        **paper
-        | {
-            "angle_step": math.radians(0.5) * sparse,
-            "z_step": paper["z_step"] * sparse,
-            "pixel_size": 4 * paper["pixel_size"],
-            "shape": (rows, 128),
-        },
-    )
-    voxel = 4 * paper["pixel_size"] * paper["source_to_axis"] / paper["source_to_detector"]
-    return geometry, clra.VolumeGrid(shape=(312, 120, 120), voxel_size=voxel)
+def paper_helix() -> tuple[Any, Any]:
+    """Geometry of all views and grid of the paper's helix at a quarter of the resolution."""
+    planes, columns = (size // 4 for size in SAMPLE)
+    grid = clra.VolumeGrid(shape=(planes, columns, columns), voxel_size=4 * VOXEL)
+    return geometry_of("helix", 1).binned(4), grid
 
 
 def tilted(geometry: Any) -> Any:
@@ -172,7 +162,10 @@ def projectors(bench: Bench) -> Iterator[Case]:
 
 def helix(bench: Bench) -> Iterator[Case]:
     size = "paper's helix at QR: 120x120x312, 216 views of 128^2"
-    yield from _projecting(bench, *paper_helix(216, 128), size)
+    geometry, grid = paper_helix()
+    # The square in the middle of every 16th panel.
+    part = replace(geometry.subset(slice(None, None, 16)), shape=(128, 128))
+    yield from _projecting(bench, part, grid, size)
 
 
 def _fdk(bench: Bench, geometry: Any, grid: Any, projections: Floats) -> Callable[[], Any]:
@@ -264,13 +257,10 @@ def registration(bench: Bench) -> Iterator[Case]:
 
 def iteration(bench: Bench) -> Iterator[Value]:
     """Filter, back-project, forward-project, register: one iteration of an alignment."""
-    geometry, grid = paper_helix(3456, 232)
-    phantom = three_spheres(60 * grid.voxel_size, 312 * grid.voxel_size)
-    motion = random_motion(3456, seed=1, shift=(-2.0, 2.0))
-    moved = geometry.with_motion(motion)
-    projections = np.concatenate(
-        [phantom.line_integrals(moved, start, start + 128) for start in range(0, 3456, 128)]
-    )
+    geometry, grid = paper_helix()
+    motion = random_motion(geometry.views, seed=1, shift=(-2.0, 2.0))
+    projections = np.empty((geometry.views, *geometry.shape), np.float32)
+    project(projections, geometry.with_motion(motion))
     scan = clra.Scan(projections, geometry)
     # align() adds 15 per cent of margin at each end of the grid: 240 planes become 312.
     grid = clra.VolumeGrid(shape=(240, 120, 120), voxel_size=grid.voxel_size)
@@ -282,24 +272,14 @@ def iteration(bench: Bench) -> Iterator[Value]:
 
 def alignment(bench: Bench) -> Iterator[Value]:
     """Align at the paper's full size; the radiographs, 6.6 GB, are read from a file."""
-    paper = dict(PAPER)
-    views, step = 3456, math.radians(0.5)
-    geometry = clra.helix(views, angle_step=step, **paper)
-    voxel = paper["pixel_size"] * paper["source_to_axis"] / paper["source_to_detector"]
-    phantom = three_spheres(240 * voxel, 1248 * voxel)
-    moved = geometry.with_motion(random_motion(views, seed=1, shift=(-10.0, 8.0)))
-    grid = clra.VolumeGrid(shape=(960, 480, 480), voxel_size=voxel)  # 1248 with align()'s margin
-    with tempfile.NamedTemporaryFile() as file:
-        shape = (views, *geometry.shape)
-        projections = np.memmap(file.name, np.float32, "w+", shape=shape)
-        for start in range(0, views, 64):
-            projections[start : start + 64] = phantom.line_integrals(moved, start, start + 64)
-        scan = clra.Scan(projections, geometry)
+    grid = clra.VolumeGrid(shape=(960, 480, 480), voxel_size=VOXEL)  # 1248 with align()'s margin
+    with tempfile.TemporaryDirectory() as folder:
+        scan = moved_scan("helix", "random", 1, 0.0, Path(folder))
         begin, begin_processor = time.perf_counter(), time.process_time()
         clra.align(scan, schedule="1QR-1HR", grid=grid, device=bench.queue.device)
         seconds = time.perf_counter() - begin
         processor = time.process_time() - begin_processor
-        del scan, projections
+        del scan
     size = "paper's helix: 480x480x1248, 3456 views of 928x512"
     times = {"clra": [seconds]}, {"clra": [processor]}
     yield Value("1QR-1HR", size, "s", {"clra": seconds}, *times)

@@ -57,6 +57,13 @@ def true_motion(
     return without_gauge(drawn, geometry, clouds, magnification > 0)
 
 
+def project(images: NDArray[np.float32], geometry: clra.ConeBeamGeometry) -> None:
+    """Fill `images` with radiographs of the spheres, a few at a time."""
+    for start in range(0, geometry.views, 32):
+        stop = min(start + 32, geometry.views)
+        images[start:stop] = SPHERES.line_integrals(geometry, start, stop)
+
+
 def moved_scan(
     trajectory: str, motion: str, scale: int, magnification: float, folder: Path, seed: int = 1
 ) -> clra.Scan:
@@ -69,10 +76,7 @@ def moved_scan(
         shape = (geometry.views, *geometry.shape)
         partial = path.with_suffix(".partial")
         images = np.lib.format.open_memmap(partial, "w+", np.float32, shape)
-        moved = geometry.with_motion(truth)
-        for start in range(0, geometry.views, 32):
-            stop = min(start + 32, geometry.views)
-            images[start:stop] = SPHERES.line_integrals(moved, start, stop)
+        project(images, geometry.with_motion(truth))
         images.flush()
         partial.rename(path)
     return clra.Scan(np.load(path, mmap_mode="r"), geometry, name=name, truth=truth)
