@@ -14,46 +14,31 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.fbp import ramp_fbp
 from clra.methods.multigrid import (
     MultigridResult,
     Progressed,
     ReconstructionInterrupted,
     Step,
 )
-from clra.methods.osem_tr import VOLUMES, OrderedSubsets, osem_tr, start_volume
+from clra.methods.multigrid_level import MultigridLevel
+from clra.methods.osem_tr import OrderedSubsets
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
-from clra.methods.reprojection import (
-    Registered,
-    binned_mask,
-    in_full_pixels,
-    register,
-    registration_for,
-    reprojected,
-    with_margin,
-)
-from clra.methods.residuals import between, residuals
+from clra.methods.reprojection import Registered, with_margin
+from clra.methods.residuals import between
 from clra.methods.results import AlignmentResult, Iteration
 from clra.model.gauge import Gauge, sample_points
-from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import converged, level_name, parse_levels
 from clra.model.visibility import sampled
-from clra.ops.memory import Store
-from clra.ops.multigrid import add_update, cropped, prolongate, restrict
-from clra.ops.registration import ESTIMATE_FIELDS
-from clra.ops.streaming import Radiographs, Stream, Volume
-
-Floats = NDArray[np.float64]
+from clra.ops.multigrid import add_update, cropped
+from clra.ops.streaming import Stream, Volume
 
 # Cycles after which it ends in any case; without alignment a second one changes little.
 _CYCLES, _CYCLES_UNALIGNED = 3, 1
 # A cycle whose misfit at full resolution is no smaller than this part of the last one's is in vain.
 _FALLS = 0.98
-# At the levels that are corrected, the device holds the volume and its correction.
-_VOLUMES = 2
 
 
 def imgr(
@@ -148,7 +133,7 @@ class _Run:
     stream: Stream
     scan: Scan
     grid: VolumeGrid
-    levels: Sequence[int]
+    factors: Sequence[int]
     align: bool
     scale: bool
     anchor: bool
@@ -163,64 +148,49 @@ class _Run:
         points = sample_points(self.grid)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
-        self._radiographs: dict[int, Radiographs] = {}
+        self._levels: dict[int, MultigridLevel] = {}
 
     def cycles(self, most: int) -> None:
         """Algorithm 3, steps 3 to 25."""
         while not self.done.ended:
-            cycle, position = divmod(len(self.done.steps), len(self.levels))
-            title = f"cycle {cycle + 1}, {level_name(self.levels[position])}"
-            done = self._level(self.levels[position], cycle + 1, title)
+            cycle, position = divmod(len(self.done.steps), len(self.factors))
+            title = f"cycle {cycle + 1}, {level_name(self.factors[position])}"
+            done = self._correct(self._level(self.factors[position]), cycle + 1, title)
             # 22, 25: until converged
-            last = position + 1 == len(self.levels)
+            last = position + 1 == len(self.factors)
             ended = last and (cycle + 1 == most or self._converged(done))
             self.done = replace(done, ended=ended)
 
-    def _level(self, level: int, cycle: int, title: str) -> Progressed:
+    def _correct(self, level: MultigridLevel, cycle: int, title: str) -> Progressed:
         """One resolution of a cycle: steps 4 to 9, 10 to 15, or 16 to 21."""
         started = time.perf_counter()
-        radiographs, before = self._measured(level), self.done.motion
+        before = self.done.motion
         # 2, 23, 11, 17: the volume so far at this resolution
-        geometry = self._geometry(before, level)
-        volume = self._so_far(radiographs, geometry)
+        volume = self._so_far(level)
         # 5, 12, 18: simulated radiographs; 6, 13, 19: register them with the measured ones
-        simulated, misfit, found = self._simulate(radiographs, volume, geometry, title)
+        simulated, misfit, found = level.simulate(
+            volume,
+            before,
+            registering=self.align,
+            first=not self.done.history,
+            magnification=self.scale,
+            title=title,
+        )
         # 7, 14, 20: transform, by absorbing the motion in the geometry
         motion, weak = (before, self.done.weak) if found is None else self._moved(found)
-        geometry = self._geometry(motion, level)
+        shape = self.scan.geometry.shape
+        moved = between(before, motion, shape, level.factor) if self.align else None
         # 15, 21: calculate the update, back-project and filter
-        lack = residuals(
-            self.stream,
-            radiographs,
-            simulated,
-            self._used(level),
-            moved=between(before, motion, self.scan.geometry.shape, level) if self.align else None,
+        update = level.correction(
+            simulated, motion, volume.grid, moved=moved, believed=~weak, title=title
         )
-        update = ramp_fbp(
-            self.stream,
-            lack,
-            geometry,
-            volume.grid,
-            believed=~weak,
-            stage=f"{title}: correcting",
-            volumes=self._volumes(level),
-        )
-        del simulated, lack
-        add_update(self.stream, volume, update, sampled(geometry, volume.grid))
+        del simulated
+        add_update(self.stream, volume, update, sampled(level.geometry(motion), volume.grid))
         del update
-        if level == self.levels[0]:
+        if level.lowest:
             # 9: OSEM-TR
-            osem_tr(
-                self.stream,
-                radiographs,
-                geometry,
-                volume,
-                self.osem,
-                used=self._used(level),
-                believed=~weak,
-                stage=f"{title}: OSEM-TR",
-            )
-        step = Step(cycle, level_name(level), misfit, time.perf_counter() - started)
+            level.reconstruct(volume, motion, ~weak, title)
+        step = Step(cycle, level_name(level.factor), misfit, time.perf_counter() - started)
         self.stream.report(f"{title}: misfit {misfit:.4g} before", 1, 1)
         return Progressed(
             volume,
@@ -230,51 +200,14 @@ class _Run:
             self.done.history if found is None else self._history(step, motion, found),
         )
 
-    def _so_far(self, radiographs: Radiographs, geometry: ConeBeamGeometry) -> Volume:
-        """Bring what there is to the resolution of the radiographs."""
-        level, volume = radiographs.level, self.done.volume
-        volumes = self._volumes(level)
-        if volume is None:  # 1, 2
-            if self.align:
-                odd = odd_radiographs(self.stream, radiographs)
-                self.done = replace(self.done, weak=odd)
-            grid = self._grid(level)
-            return start_volume(
-                self.stream, radiographs, geometry, grid, self.osem, believed=~self.done.weak
-            )
-        if level != self.levels[0]:  # 11, 17
-            return prolongate(self.stream, volume, self._grid(level), volumes=volumes)
-        for _ in range(level.bit_length() - 1):  # 23
-            volume = restrict(self.stream, volume, volumes=volumes)
-        return volume
-
-    def _simulate(
-        self, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, title: str
-    ) -> tuple[Store, float, Registered | None]:
-        """Project the volume, once; compare and, if asked, register chunk by chunk."""
-        stream, level = self.stream, radiographs.level
-        simulated = Store(radiographs.shape, stream.room)
-        statistics = self.osem.statistics(stream, self._used(level), level)
-        registration = registration_for(
-            stream,
-            self.scan,
-            radiographs,
-            first=not self.done.history,
-            magnification=self.scale,
-        ) if self.align else None  # fmt: skip
-        table = np.empty((geometry.views, len(ESTIMATE_FIELDS)))
-        magnification = self.done.motion.magnification
-        stage = f"{title}: simulating"
-        for views, measured, made in reprojected(stream, radiographs, volume, geometry, stage):
-            statistics.deviance(stream.queue, made, measured)
-            simulated.write(views.start, stream.download(made))
-            if registration is not None:
-                known = magnification[views]
-                table[views] = register(stream, registration, measured, made, known)
-        misfit = statistics.misfit(stream.queue, geometry.views)
-        rows, columns = self.scan.geometry.shape
-        lost = (rows % level, columns % level)
-        return simulated, misfit, in_full_pixels(table, level, lost) if self.align else None
+    def _so_far(self, level: MultigridLevel) -> Volume:
+        """Bring what there is to a level's resolution."""
+        if self.done.volume is not None:
+            return level.brought(self.done.volume)
+        if self.align:
+            odd = odd_radiographs(self.stream, level.radiographs)
+            self.done = replace(self.done, weak=odd)
+        return level.first(self.done.motion, ~self.done.weak)
 
     def _moved(self, found: Registered) -> tuple[Motion, NDArray[np.bool_]]:
         """Append what was found to the motion; also which views are not believed."""
@@ -303,7 +236,7 @@ class _Run:
     def _converged(self, done: Progressed) -> bool:
         """Tell whether another cycle is worth nothing."""
         before, after = self.done.motion, done.motion
-        count = len(self.levels)
+        count = len(self.factors)
         if len(done.steps) > count and (
             done.steps[-1].misfit > _FALLS * done.steps[-1 - count].misfit
         ):
@@ -324,30 +257,19 @@ class _Run:
             sigma=self.registered.sigma,
             gauge=dict(self.gauge.fit(self.found).rms_by_mode),
             flagged=tuple(int(view) for view in np.flatnonzero(weak)),
-            schedule="-".join(map(level_name, self.levels)),
+            schedule="-".join(map(level_name, self.factors)),
             device=self.stream.device.name.strip(),
         )
 
-    def _measured(self, level: int) -> Radiographs:
-        """1: down-sample the measured radiographs, once a level."""
-        if level not in self._radiographs:
-            self._radiographs[level] = Radiographs(self.stream, self.scan, level)
-        return self._radiographs[level]
-
-    def _geometry(self, motion: Motion, level: int) -> ConeBeamGeometry:
-        """Motions are in full-resolution pixels: absorb first, then bin."""
-        return self.scan.geometry.with_motion(motion).binned(level)
-
-    def _grid(self, level: int) -> VolumeGrid:
-        return self.grid.binned(level) if level > 1 else self.grid
-
-    def _volumes(self, level: int) -> int:
-        """Volumes that the device holds at a time."""
-        return VOLUMES if level == self.levels[0] else _VOLUMES
-
-    def _used(self, level: int) -> NDArray[np.bool_]:
-        """Pixels of the binned panel that count."""
-        mask = self.scan.mask
-        return binned_mask(
-            np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask, level
-        )
+    def _level(self, factor: int) -> MultigridLevel:
+        """Make the levels as they are needed, once each."""
+        if factor not in self._levels:
+            self._levels[factor] = MultigridLevel(
+                self.stream,
+                self.scan,
+                self.grid,
+                self.osem,
+                factor,
+                lowest=factor == self.factors[0],
+            )
+        return self._levels[factor]
