@@ -184,27 +184,33 @@ def correct(
     """Write a scan of corrected radiographs.
 
     For programs that cannot take a motion: each radiograph is resampled, once. clra itself
-    reconstructs sharper from the scan as it is, with --motion.
+    reconstructs sharper from the scan as it is, with --motion. Views that the alignment flagged,
+    blank or wrong ones, keep their places in the file, but are marked invalid (image_key 3): clra
+    and other readers of NXtomo leave them out.
 
     Examples
     --------
       clra correct scan.nxs --motion motion.h5 -o corrected.nxs
     """
+    from clra.app.describe import views_flagged
     from clra.app.outputs import motion_for, room_for
     from clra.io.scans import write_scan
     from clra.methods.correction import correct as correct_scan
 
     limits = memory.limits()
     opened = reading.scan(scan)
-    opened, known, _ = motion_for(opened, motion)
+    opened, known, believed = motion_for(opened, motion)
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns)
     with console.progress() as progress:
         corrected = correct_scan(opened, known, console.device, **limits)
-        write_scan(out, corrected, progress=progress)
+        write_scan(out, corrected, believed=believed, progress=progress)
+    invalid = (~believed).nonzero()[0].tolist()
+    marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
     console.summary(
-        {"file": out, "shape": opened.shape},
-        f"wrote {out}: {views} corrected radiographs of {rows} x {columns}",
+        {"file": out, "shape": opened.shape, "invalid": invalid},
+        f"wrote {out}: {views} corrected radiographs of {rows} x {columns}"
+        + marked * bool(invalid),
     )
 
 

@@ -1,6 +1,7 @@
 """What a scan is, in the words and units of a microscopist."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -218,6 +219,17 @@ def metric(millimetres: float) -> str:
     if size >= 0.5 or size == 0:
         return f"{millimetres:.4g} mm"
     return f"{millimetres * 1000:.4g} um"
+
+
+def views_flagged(views: Sequence[int]) -> str:
+    """Count and list views that are not believed; the motion file and --json have them all."""
+    return f"{len(views)} views flagged" + (f": {listed(views, 20)}" if views else "")
+
+
+def listed(numbers: Sequence[int], most: int) -> str:
+    """List numbers, up to so many: "3, 17 and 2 more"."""
+    more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
+    return f"{', '.join(map(str, numbers[:most]))}{more}"
 
 
 def table(lines: dict[str, str]) -> str:

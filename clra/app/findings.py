@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.app.describe import Facts, table
+from clra.app.describe import Facts, table, views_flagged
 from clra.app.progress import duration
 from clra.app.records import Record
 from clra.model.gauge import Gauge, sample_points
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from clra.ops.streaming import Report
 
 Floats = NDArray[np.float64]
-
-_LISTED = 20  # flagged views; the motion file and --json have them all
 
 
 @dataclass(frozen=True)
@@ -201,7 +199,7 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
         "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
         f"largest {largest_u:.2f}, {largest_v:.2f}",
         "magnification": f"{least:.5f} to {most:.5f}",
-        "confidence": f"median {np.median(confidence):.3f}, {_flagged(record)}",
+        "confidence": f"median {np.median(confidence):.3f}, {views_flagged(record.flagged)}",
     }
     if record.gauge:
         lines["unobservable"] = _unobservable(record)
@@ -220,13 +218,6 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
         if record.flagged:
             lines["not flagged"] = _error(means, "believed_", record)
     return values, table(lines)
-
-
-def _flagged(record: Record) -> str:
-    """Count and list the views that are not believed."""
-    few, count = ", ".join(map(str, record.flagged[:_LISTED])), len(record.flagged)
-    more = f" and {count - _LISTED} more" if count > _LISTED else ""
-    return f"{count} views flagged" + (f": {few}{more}" if count else "")
 
 
 def _unobservable(record: Record) -> str:

@@ -66,12 +66,15 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, 
     Raises
     ------
     InputError
-        If it is of another number of views. That it was estimated from other radiographs is only
-        worth a warning: two channels of a scan share a motion.
+        If it is of another number of views, or all of them were flagged. That it was estimated from
+        other radiographs is only worth a warning: two channels of a scan share a motion.
     """
     file = read_motion_file(path)
     _check(scan, file.motion, file.attributes.get("checksum", ""), path)
     believed = all_but(file.flagged, scan.views)
+    if not believed.any():
+        found = f"all {scan.views} views"
+        raise InputError.at(path, "/motion/flagged", found, "at least one that is not flagged")
     return focused(scan, file.attributes, path), file.motion, believed
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clra.app import figures, page, pictures
+from clra.app.describe import listed
 from clra.app.findings import Errors, Findings
 from clra.app.progress import duration
 from clra.app.records import Record
@@ -282,8 +283,7 @@ def _trust(record: Record) -> str:
             )
         )
     if flagged:
-        more = f" and {len(flagged) - 40} more" if len(flagged) > 40 else ""
-        parts.append(page.paragraph(f"Flagged views: {', '.join(map(str, flagged[:40]))}{more}."))
+        parts.append(page.paragraph(f"Flagged views: {listed(flagged, 40)}."))
     if record.gauge:
         unobservable = record.about.get("unobservable", "")
         parts += [

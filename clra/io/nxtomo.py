@@ -16,8 +16,8 @@ from clra.io.nxfields import Overrides, read_fields
 from clra.io.radiographs import Radiographs
 from clra.model.scan import Scan
 
-# Values of image_key. 3 is an invalid frame; image_key_control has -1 for a control frame.
-PROJECTION, FLAT, DARK = 0, 1, 2
+# Values of image_key; image_key_control has -1 for a control frame.
+PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 
 
 def read_nxtomo(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clra.io.atomic import atomic_path
 from clra.io.nxclra import KIND_ATTRIBUTE, KINDS, write_additions
 from clra.io.nxgeometry import Fields, fields_of, top_down
-from clra.io.nxtomo import DARK, FLAT, PROJECTION
+from clra.io.nxtomo import DARK, FLAT, INVALID, PROJECTION
 from clra.io.reporting import Report, tell
 from clra.io.slabs import SlabWriter, reserve
 from clra.model.geometry import ConeBeamGeometry
@@ -39,6 +39,7 @@ def write_nxtomo(
     name: str = "scan",
     truth: Motion | None = None,
     mask: NDArray[np.bool_] | None = None,
+    believed: NDArray[np.bool_] | None = None,
     fields: Fields | None = None,
     propagation_distance: float | None = None,
     progress: Report | None = None,
@@ -68,6 +69,9 @@ def write_nxtomo(
         The motion that a simulation put in.
     mask : ndarray of bool, (rows, columns), optional
         True where the pixels may be used.
+    believed : ndarray of bool, (views,), optional
+        Radiographs to be used, at least one; the frames of others keep their places, and are marked
+        as invalid ones. All by default.
     fields : Fields, optional
         The geometry in NXtomo's terms, where it came from them; else they are worked out.
     propagation_distance : float, optional
@@ -78,7 +82,7 @@ def write_nxtomo(
     Raises
     ------
     ValueError
-        If the arrays do not fit the geometry.
+        If the arrays do not fit the geometry, or no radiograph is to be used.
     OutputError
         If the file cannot be written.
     """
@@ -92,8 +96,15 @@ def write_nxtomo(
     for _, part in parts:
         if tuple(part.shape[1:]) != geometry.shape:
             raise ValueError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
+    if believed is None:
+        believed = np.ones(geometry.views, np.bool_)
+    if believed.shape != (geometry.views,) or not believed.any():
+        found = f"shape {believed.shape} with {believed.sum()} radiographs"
+        raise ValueError(f"believed: found {found}, expected ({geometry.views},) with one or more")
     pixels = np.dtype(dtype if dtype is not None else radiographs[0:1].dtype).newbyteorder("=")
     roles = np.concatenate([np.full(part.shape[0], role, np.int32) for role, part in parts])
+    views = np.flatnonzero(roles == PROJECTION)
+    roles[views[~believed]] = INVALID
     shape = (len(roles), *geometry.shape)
     geometry, reverse = top_down(geometry)
     if reverse and truth is not None:
@@ -114,7 +125,7 @@ def write_nxtomo(
             file.attrs["default"] = "entry"
             data, offset = _detector(entry, fields, roles, shape, pixels)
             data.attrs[KIND_ATTRIBUTE] = kind
-            _sample(entry, fields, roles, name, propagation_distance)
+            _sample(entry, fields, len(roles), name, propagation_distance)
             _links(entry, name)
             write_additions(
                 entry,
@@ -122,7 +133,7 @@ def write_nxtomo(
                 exact=exact,
                 truth=truth,
                 mask=mask[::-1] if reverse and mask is not None else mask,
-                views=np.flatnonzero(roles == PROJECTION),
+                views=views,
                 count=len(roles),
             )
         with SlabWriter(temporary, offset, shape, pixels) as writer:
@@ -155,13 +166,13 @@ def _detector(
     instrument = _group(entry, "instrument", "NXinstrument")
     source = _group(instrument, "source", "NXsource")
     source["probe"] = "x-ray"
-    _put(source, "distance", -_one_or_each(fields.source_distance, roles), "mm")
+    _put(source, "distance", -_one_or_each(fields.source_distance, len(roles)), "mm")
     detector = _group(instrument, "detector", "NXdetector")
     detector["image_key"] = roles
     detector["image_key_control"] = roles
     _put(detector, "x_pixel_size", fields.pixel[0], "mm")
     _put(detector, "y_pixel_size", fields.pixel[1], "mm")
-    _put(detector, "distance", _one_or_each(fields.detector_distance, roles), "mm")
+    _put(detector, "distance", _one_or_each(fields.detector_distance, len(roles)), "mm")
     data, offset = reserve(detector, "data", shape, pixels)
     data.attrs["interpretation"] = "image"
     return data, offset
@@ -170,16 +181,16 @@ def _detector(
 def _sample(
     entry: h5py.Group,
     fields: Fields,
-    roles: NDArray[np.int32],
+    count: int,
     name: str,
     propagation_distance: float | None,
 ) -> None:
     """Write the sample: its name, angles and translations."""
     sample = _group(entry, "sample", "NXsample")
     sample["name"] = name
-    _put(sample, "rotation_angle", _spread(np.rad2deg(fields.angle), roles), "degree")
+    _put(sample, "rotation_angle", _spread(np.rad2deg(fields.angle), count), "degree")
     for axis, values in zip("xyz", fields.translation.T, strict=True):
-        _put(sample, f"{axis}_translation", _spread(values, roles), "mm")
+        _put(sample, f"{axis}_translation", _spread(values, count), "mm")
     if propagation_distance is not None:
         _put(sample, "propagation_distance", propagation_distance, "mm")
 
@@ -213,13 +224,11 @@ def _put(group: h5py.Group, name: str, value: Any, unit: str) -> None:
     group[name].attrs["units"] = unit
 
 
-def _spread(values: NDArray[np.float64], roles: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Values of the radiographs at their frames; flats and darks get those of the first."""
-    spread = np.full(len(roles), values[0])
-    spread[roles == PROJECTION] = values
-    return spread
+def _spread(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Values of the radiographs at the last frames; flats and darks get those of the first."""
+    return np.concatenate([np.full(count - len(values), values[0]), values])
 
 
-def _one_or_each(values: NDArray[np.float64], roles: NDArray[np.int32]) -> Any:
+def _one_or_each(values: NDArray[np.float64], count: int) -> Any:
     """Return the one value where all are equal, as NXtomo has it."""
-    return values[0] if np.all(values == values[0]) else _spread(values, roles)
+    return values[0] if np.all(values == values[0]) else _spread(values, count)

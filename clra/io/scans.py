@@ -76,7 +76,13 @@ def read_scan(
     return read_nxtomo(path, entry=entry, overrides=overrides, white=white)
 
 
-def write_scan(path: str | os.PathLike[str], scan: Scan, *, progress: Report | None = None) -> None:
+def write_scan(
+    path: str | os.PathLike[str],
+    scan: Scan,
+    *,
+    believed: NDArray[np.bool_] | None = None,
+    progress: Report | None = None,
+) -> None:
     """Write a scan's line integrals as NXtomo; the file appears whole or not at all.
 
     Parameters
@@ -85,11 +91,16 @@ def write_scan(path: str | os.PathLike[str], scan: Scan, *, progress: Report | N
         The file.
     scan : Scan
         Read some views at a time.
+    believed : ndarray of bool, (views,), optional
+        Views to be used, at least one, all by default. The others are written as well, marked
+        invalid: readers of NXtomo, :func:`read_scan` too, leave them out.
     progress : callable, optional
         Called with a ``Progress`` as frames are written.
 
     Raises
     ------
+    ValueError
+        If `believed` is not of these views, or none.
     OutputError
         If the file cannot be written.
     """
@@ -102,6 +113,7 @@ def write_scan(path: str | os.PathLike[str], scan: Scan, *, progress: Report | N
         name=scan.name,
         truth=scan.truth,
         mask=scan.mask,
+        believed=believed,
         progress=progress,
     )
 

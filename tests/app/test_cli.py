@@ -120,8 +120,12 @@ def test_bad_input_is_refused_before_work(clra, scan_file, motion_file, tmp_path
         ["report", tmp_path / "short.h5", "-o", tmp_path / "r.html", "--scan", scan_file],
     ):
         refused(clra(*arguments), 2, "short.h5", "7 views", "24")
+    write_motion_file(tmp_path / "none.h5", Motion.identity(24), flagged=range(24))
+    for command, out in (("reconstruct", volume), ("correct", tmp_path / "c.nxs")):
+        found = clra(command, scan_file, "-o", out, "--motion", tmp_path / "none.h5")
+        refused(found, 2, "none.h5", "/motion/flagged", "all 24 views")
     left = sorted(file.name for file in tmp_path.iterdir())
-    assert left == ["motion.h5", "short.h5"]
+    assert left == ["motion.h5", "none.h5", "short.h5"]
 
 
 def test_simulate_writes_a_scan_that_knows_its_motion(clra, tmp_path):

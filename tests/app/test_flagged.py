@@ -109,3 +109,38 @@ def test_flagged_views_are_left_out_of_the_volume(clra, measured, tmp_path, meth
         volumes.append(read_volume(out)[0])
     assert volumes[0].std() > 0
     assert np.array_equal(*volumes)
+
+
+def test_flagged_views_are_marked_invalid_where_radiographs_are_corrected(clra, measured, tmp_path):
+    motion, source, out = tmp_path / "m.h5", tmp_path / "bad.nxs", tmp_path / "c.nxs"
+    write_scan(source, spoilt(measured, [0.0, 9.0]))
+    write_motion_file(motion, read_scan(source).truth, flagged=[BLANK, SATURATED])
+    code, told, err = clra("correct", source, "--motion", motion, "-o", out)
+    assert code == 0, err
+    assert f"2 views flagged: {BLANK}, {SATURATED}; marked invalid" in told
+    with h5py.File(out) as file:
+        keys = file["entry/instrument/detector/image_key"][()]
+        assert np.flatnonzero(keys == 3).tolist() == [BLANK, SATURATED]
+        assert (np.delete(keys, [BLANK, SATURATED]) == 0).all()
+    # What is read back is the views that are left, as they would have been without motion.
+    corrected = read_scan(out)
+    believed = np.delete(np.arange(VIEWS), [BLANK, SATURATED])
+    geometry = measured.geometry.subset(believed)
+    vectors = geometry.to_astra()
+    vectors[:, 9:] *= -1  # rows run down in a file
+    assert np.allclose(corrected.geometry.to_astra(), vectors, rtol=0, atol=1e-9)
+    ideal = sample("porous", measured.geometry).line_integrals(geometry)
+    error, before = (
+        np.sqrt(np.mean((images - ideal)[:, 6:-6, 6:-6] ** 2, axis=(1, 2)))
+        for images in (corrected.read(0, 58)[:, ::-1], measured.read(0, 60)[believed])
+    )
+    assert (error < 0.02 * ideal.max()).all() and np.median(error / before) < 0.2
+
+
+def test_nothing_is_marked_where_nothing_was_flagged(clra, measured, bad_file, tmp_path):
+    motion, out = tmp_path / "m.h5", tmp_path / "c.nxs"
+    write_motion_file(motion, measured.truth)
+    code, told, err = clra("correct", bad_file, "--motion", motion, "-o", out)
+    assert code == 0, err
+    assert "flagged" not in told
+    assert read_scan(out).views == VIEWS

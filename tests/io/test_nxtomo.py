@@ -233,21 +233,43 @@ def test_far_source_survives(tmp_path: Path) -> None:
     np.testing.assert_allclose(plain.to_astra(), geometry.to_astra(), rtol=0, atol=far * ROUNDING)
 
 
-def test_marking_a_frame_invalid_keeps_vectors_and_truth_in_step(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", ["writing", "hand"])
+@pytest.mark.parametrize("vectors", [True, False])
+def test_invalid_frames_keep_geometry_and_truth_in_step(
+    tmp_path: Path, by: str, vectors: bool
+) -> None:
     geometry = upside_down(TRAJECTORIES["helix"])
     path = tmp_path / "scan.nxs"
     flats = np.full((2, 5, 6), 1000, np.uint16)
-    pixels = np.full((9, 5, 6), 500, np.uint16)
+    pixels = np.tile(np.arange(100, 1000, 100, np.uint16)[:, None, None], (1, 5, 6))
     truth = Motion(shift_u=np.arange(9.0), shift_v=np.zeros(9))
-    write_nxtomo(path, pixels, geometry, flats=flats, darks=flats[:1] * 0, truth=truth)
+    options = {"flats": flats, "darks": flats[:1] * 0, "truth": truth}
+    kept = np.delete(np.arange(9), [0, 4])
+    if by == "writing":
+        options["believed"] = np.isin(np.arange(9), kept)
+    write_nxtomo(path, pixels, geometry, **options)
     with h5py.File(path, "r+") as file:
         for key in ("image_key", "image_key_control"):
-            file[f"entry/instrument/detector/{key}"][3 + 4] = 3
+            keys = file[f"entry/instrument/detector/{key}"]
+            if by == "hand":
+                keys[[3, 3 + 4]] = 3
+            assert keys[()].tolist() == [2, 1, 1, 3, 0, 0, 0, 3, 0, 0, 0, 0]
+        if not vectors:
+            del file["entry/clra/cone_vectors"]
     scan = read_scan(path)
-    kept = np.delete(np.arange(9), 4)
-    assert scan.geometry == geometry.subset(kept)
+    expected = geometry.subset(kept).to_astra()
+    np.testing.assert_allclose(scan.geometry.to_astra(), expected, rtol=0, atol=300 * ROUNDING)
     np.testing.assert_array_equal(scan.truth.shift_u, kept)
-    np.testing.assert_allclose(scan.projections[0:8], 0.5)
+    np.testing.assert_allclose(scan.projections[0:7][:, 0, 0], 0.1 * (1 + kept), rtol=1e-6)
+    assert "2 frames marked invalid left out" in scan.projections.notes
+
+
+@pytest.mark.parametrize("believed", [np.ones(8, np.bool_), np.zeros(9, np.bool_)])
+def test_choices_of_views_that_are_none(tmp_path: Path, believed: np.ndarray) -> None:
+    scan = Scan(np.zeros((9, 5, 6), np.float32), TRAJECTORIES["circular"])
+    with pytest.raises(ValueError, match=r"believed: found .*, expected \(9,\) with one or more"):
+        write_scan(tmp_path / "scan.nxs", scan, believed=believed)
+    assert not list(tmp_path.iterdir())
 
 
 def test_chunks_do_not_matter(nxtomo_file: Builder, tmp_path: Path) -> None:

@@ -35,13 +35,14 @@ def test_the_package_reads_what_we_write(tmp_path: Path, units) -> None:
     flats = np.full((2, 5, 7), 1000, np.uint16)
     darks = np.full((3, 5, 7), 10, np.uint16)
     path = tmp_path / "scan.nxs"
-    write_nxtomo(path, pixels, geometry, flats=flats, darks=darks, name="helix")
+    frames, believed = {"flats": flats, "darks": darks}, np.arange(6) != 2
+    write_nxtomo(path, pixels, geometry, **frames, believed=believed, name="helix")
 
     read = NXtomo().load(str(path), "entry", detector_data_as="as_numpy_array")
     NXtomo.check_consistency(read, raises_error=True)
     detector, sample = read.instrument.detector, read.sample
     np.testing.assert_array_equal([int(k.value) for k in detector.image_key_control],
-                                  [2] * 3 + [1] * 2 + [0] * 6)  # fmt: skip
+                                  [2] * 3 + [1] * 2 + [0, 0, 3, 0, 0, 0])  # fmt: skip
     np.testing.assert_array_equal(detector.data[-6:], pixels[:, ::-1])
     assert read.title == "helix"
     assert detector.distance.to(units.mm).magnitude == pytest.approx(270.0)
