@@ -1,12 +1,11 @@
-import importlib.util
-import sys
+import importlib
 from pathlib import Path
 
 import pytest
 
 from clra import kernels
 
-_FILE = Path(__file__).parents[2] / "tools" / "check_gpu.py"
+_TOOLS = Path(__file__).parents[2] / "tools"
 
 PTXAS = """\
 ptxas info    : 0 bytes gmem
@@ -21,14 +20,16 @@ ptxas info    : Used 19 registers, used 0 barriers, 408 bytes cmem[0]
 """
 
 
-@pytest.fixture(scope="module")
-def check_gpu():
-    spec = importlib.util.spec_from_file_location("check_gpu", _FILE)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["check_gpu"] = module  # where dataclass looks for the module's names
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["check_gpu"]
+@pytest.fixture
+def check_gpu(monkeypatch):
+    monkeypatch.syspath_prepend(str(_TOOLS))
+    return importlib.import_module("check_gpu")
+
+
+@pytest.fixture
+def gpu_usage(monkeypatch):
+    monkeypatch.syspath_prepend(str(_TOOLS))
+    return importlib.import_module("gpu_usage")
 
 
 def test_every_kernel_file_has_its_forms(check_gpu):
@@ -36,8 +37,8 @@ def test_every_kernel_file_has_its_forms(check_gpu):
     assert not set(check_gpu.GPU_FORMS) & check_gpu.CPU_ONLY
 
 
-def test_ptxas_report(check_gpu):
-    first, second = check_gpu.read_ptxas(PTXAS, "warp.cl", "sm_80", 164 << 10)
+def test_ptxas_report(gpu_usage):
+    first, second = gpu_usage.read_ptxas(PTXAS, "warp.cl", "sm_80", 164 << 10)
     assert (first.kernel, first.registers, first.spills) == ("warp.cl first", 80, 20)
     assert (first.private, first.local) == (64, 1024)
     assert (second.registers, second.spills, second.private, second.local) == (19, 0, 0, 0)
@@ -57,6 +58,6 @@ def test_ptxas_report(check_gpu):
         (16, (81 << 10), 256, 2 / 8),  # 164 KiB hold two
     ],
 )
-def test_occupancy(check_gpu, registers, local, work_items, expected):
-    found = check_gpu.occupancy(registers, local, work_items, 164 << 10)
+def test_occupancy(gpu_usage, registers, local, work_items, expected):
+    found = gpu_usage.occupancy(registers, local, work_items, 164 << 10)
     assert found == pytest.approx(expected)
