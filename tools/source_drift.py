@@ -74,7 +74,7 @@ def _left(
         scan.geometry.with_motion(motion),
         registration,
         magnification=motion.magnification,
-        lost=(0, 0),
+        panel=scan.geometry.shape,
     )
     return float(np.median(found.residual))
 

@@ -101,7 +101,6 @@ class Level:
             )
 
         def registered(radiographs: Radiographs, volume: Volume, doing: str) -> Registered:
-            rows, columns = self.scan.geometry.shape
             return reproject_and_register(
                 self.stream,
                 radiographs,
@@ -115,7 +114,7 @@ class Level:
                     magnification=magnification,
                 ),
                 magnification=known,
-                lost=(rows % self.factor, columns % self.factor),
+                panel=self.scan.geometry.shape,
                 stage=f"{title}: {doing}",
             )
 

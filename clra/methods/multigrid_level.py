@@ -162,9 +162,8 @@ class MultigridLevel:
                 known = motion.magnification[views]
                 table[views] = register(stream, registration, measured, made, known)
         misfit = statistics.misfit(stream.queue, geometry.views)
-        rows, columns = self.scan.geometry.shape
-        lost = (rows % level, columns % level)
-        return simulated, misfit, in_full_pixels(table, level, lost) if registering else None
+        found = in_full_pixels(table, level, self.scan.geometry.shape) if registering else None
+        return simulated, misfit, found
 
     def correction(
         self,

@@ -87,7 +87,7 @@ def quality(
                 stream, scan, radiographs, first=False, magnification=scale, still=still
             ),
             magnification=np.ones(scan.views),
-            lost=(scan.geometry.rows % level, scan.geometry.columns % level),
+            panel=scan.geometry.shape,
             stage=f"report: re-projecting {name}",
         )
 

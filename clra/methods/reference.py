@@ -199,8 +199,7 @@ def _registered(stream: Stream, scan: Scan, reference: Scan, scale: bool) -> Reg
             unknown = np.ones(chunk.stop - chunk.start)
             table[chunk] = register(stream, registration, moved, unmoved, unknown)
         stream.report("registering with the reference", scan.views, scan.views)
-        lost = (scan.geometry.rows % level, scan.geometry.columns % level)
-        found = in_full_pixels(table, level, lost)
+        found = in_full_pixels(table, level, scan.geometry.shape)
         known = found.motion.then(known)
     return replace(found, motion=known)
 

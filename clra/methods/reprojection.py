@@ -219,7 +219,7 @@ def reproject_and_register(
     registration: Registration | PhaseCorrelation,
     *,
     magnification: Floats,
-    lost: tuple[int, int],
+    panel: tuple[int, int],
     stage: str = "registering",
 ) -> Registered:
     """Run steps 3 and 4 of Algorithm 1.
@@ -232,7 +232,7 @@ def reproject_and_register(
         Estimator for radiographs of this size.
     magnification : ndarray, (views,)
         That `geometry` has absorbed.
-    lost : (int, int)
+    panel : (int, int)
         As for :func:`in_full_pixels`.
 
     Returns
@@ -243,10 +243,10 @@ def reproject_and_register(
     for views, measured, simulated in reprojected(stream, radiographs, volume, geometry, stage):
         known = magnification[views]
         table[views] = register(stream, registration, measured, simulated, known)
-    return in_full_pixels(table, radiographs.level, lost)
+    return in_full_pixels(table, radiographs.level, panel)
 
 
-def in_full_pixels(table: Floats, level: int, lost: tuple[int, int]) -> Registered:
+def in_full_pixels(table: Floats, level: int, panel: tuple[int, int]) -> Registered:
     """Translate what was registered at a level to full resolution.
 
     Parameters
@@ -255,13 +255,13 @@ def in_full_pixels(table: Floats, level: int, lost: tuple[int, int]) -> Register
         As of :func:`register`.
     level : int
         Binning factor.
-    lost : (int, int)
-        Rows and columns of the full-resolution panel that binning dropped: the magnification is
-        about the binned panel's centre, which lies half of that away.
+    panel : (int, int)
+        Rows and columns at full resolution: the magnification is about the binned panel's centre,
+        which lies half of what binning drops away from that of the whole one.
     """
     column = {name: table[:, index] for index, name in enumerate(ESTIMATE_FIELDS)}
     magnification = column["magnification"]
-    aside_u, aside_v = (0.5 * (1 - magnification) * n for n in (lost[1], lost[0]))
+    aside_v, aside_u = (0.5 * (1 - magnification) * (n % level) for n in panel)
     return Registered(
         motion=Motion(
             shift_u=level * column["shift_u"] - aside_u,
