@@ -311,13 +311,12 @@ class _Run:
 
     def result(self) -> AlignmentResult:
         """Return what the iterations so far gave."""
-        return AlignmentResult(
-            motion=self.motion,
-            history=self.history,
-            confidence=np.clip(np.where(self.weak, 0.0, self.registered.correlation), 0.0, 1.0),
-            sigma=self.registered.sigma,
-            gauge=dict(self.gauge.fit(self.found).rms_by_mode),
-            flagged=tuple(int(view) for view in np.flatnonzero(self.weak)),
-            schedule=self.schedule,
-            device=self.stream.device.name.strip(),
+        return AlignmentResult.of(
+            self.motion,
+            self.history,
+            self.registered,
+            self.weak,
+            self.gauge.fit(self.found),
+            self.schedule,
+            self.stream.device.name,
         )

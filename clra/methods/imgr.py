@@ -247,18 +247,16 @@ class _Run:
 
     def alignment(self) -> AlignmentResult | None:
         """Return what was found of the motion, if anything was registered."""
-        weak = self.done.weak
         if self.registered is None:
             return None
-        return AlignmentResult(
-            motion=self.done.motion,
-            history=list(self.done.history),
-            confidence=np.clip(np.where(weak, 0.0, self.registered.correlation), 0.0, 1.0),
-            sigma=self.registered.sigma,
-            gauge=dict(self.gauge.fit(self.found).rms_by_mode),
-            flagged=tuple(int(view) for view in np.flatnonzero(weak)),
-            schedule="-".join(map(level_name, self.factors)),
-            device=self.stream.device.name.strip(),
+        return AlignmentResult.of(
+            self.done.motion,
+            self.done.history,
+            self.registered,
+            self.done.weak,
+            self.gauge.fit(self.found),
+            "-".join(map(level_name, self.factors)),
+            self.stream.device.name,
         )
 
     def _level(self, factor: int) -> MultigridLevel:

@@ -1,10 +1,13 @@
 """What an alignment returns."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods.reprojection import Registered
+from clra.model.gauge import GaugeFit
 from clra.model.motion import Motion
 
 Floats = NDArray[np.float64]
@@ -111,6 +114,29 @@ class AlignmentResult:
     schedule: str
     device: str
     volume: NDArray[np.float32] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        motion: Motion,
+        history: Sequence[Iteration],
+        registered: Registered,
+        weak: NDArray[np.bool_],
+        gauge: GaugeFit,
+        schedule: str,
+        device: str,
+    ) -> "AlignmentResult":
+        """Sum up what the last registration found; views that are `weak` have no confidence."""
+        return cls(
+            motion=motion,
+            history=list(history),
+            confidence=np.clip(np.where(weak, 0.0, registered.correlation), 0.0, 1.0),
+            sigma=registered.sigma,
+            gauge=dict(gauge.rms_by_mode),
+            flagged=tuple(int(view) for view in np.flatnonzero(weak)),
+            schedule=schedule,
+            device=device.strip(),
+        )
 
 
 class AlignmentInterrupted(KeyboardInterrupt):
