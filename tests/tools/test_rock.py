@@ -60,14 +60,16 @@ def test_photons_are_those_of_the_view(rock):
 
 def test_rock_fills_the_cylinder(rock, data, monkeypatch):
     monkeypatch.setenv("CLRA_TEST_DATA", str(data))
-    grid = rock.cylinder(4)
+    grid = rock.cylinder(4, "berea")
     grains = rock.berea(grid)
     assert grains.shape == grid.shape == (624, 240, 240)
     # A fifth of the sandstone is pores.
     assert grains.sum() / (np.pi * (0.97 * 120) ** 2 * 624) == pytest.approx(0.8, abs=0.02)
+    fine = rock.cylinder(4, "fine berea")
+    assert fine.shape == (1248, 480, 480) and fine.voxel_size == grid.voxel_size / 2
 
 
 def test_data_that_are_not_there(rock, monkeypatch, tmp_path):
     monkeypatch.setenv("CLRA_TEST_DATA", str(tmp_path))
     with pytest.raises(SystemExit, match=r"found no .*berea_200\.npz, expected a folder"):
-        rock.berea(rock.cylinder(4))
+        rock.berea(rock.cylinder(4, "berea"))
