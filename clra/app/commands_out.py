@@ -46,7 +46,7 @@ def align(
         typer.Option(
             metavar="TEXT",
             help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
-            "auto: 6ER-3QR-1HR on large panels, else QR, then HR, until converged. "
+            "auto: 6ER-3QR on large panels, else QR until converged; then HR until converged. "
             "With imgr the levels of a cycle: QR-HR-FR.",
         ),
     ] = "auto",

@@ -4,7 +4,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,11 @@ class Record:
     def believed(self) -> NDArray[np.bool_]:
         """Views but for the flagged ones, (views,)."""
         return all_but(self.flagged, self.motion.views)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the run warned of."""
+        return tuple(note for step in self.history for note in step.note.splitlines())
 
     @property
     def scale_estimated(self) -> bool:
@@ -167,13 +172,13 @@ def _source_travel(motion: Motion, scan: Scan) -> dict[str, str]:
 
 
 def history_of(file: MotionFile) -> tuple[Iteration, ...]:
-    """Return the iterations that a file tells; none if another version wrote other columns."""
-    names = [f.name for f in fields(Iteration)]
-    if not set(names) <= set(file.history):
+    """Return the iterations that a file tells; none if another version wrote too few columns."""
+    needed = {f.name for f in fields(Iteration) if f.default is MISSING}
+    names = [f.name for f in fields(Iteration) if f.name in file.history]
+    if not needed <= set(names):
         return ()
-    columns = [file.history[name].tolist() for name in names]
-    rows = zip(*columns, strict=True)
-    return tuple(Iteration(*map(_known, row)) for row in rows)
+    rows = zip(*(file.history[name].tolist() for name in names), strict=True)
+    return tuple(Iteration(**dict(zip(names, map(_known, row), strict=True))) for row in rows)
 
 
 def _known(value: Any) -> Any:

@@ -40,6 +40,10 @@ class Anderson:
         self._last: tuple[Floats, Floats] | None = None
         self._differences: list[tuple[Floats, Floats]] = []
 
+    def forget(self) -> None:
+        """Go on as if no steps had been made."""
+        self._last, self._differences = None, []
+
     def restart(self) -> None:
         """Go on with another f whose differences resemble those of the one before.
 
@@ -96,8 +100,12 @@ class MotionSteps:
         # Pixels by which a point of middling distance from the centre moves a unit of scale.
         self._lever = 0.25 * float(np.hypot(*shape))
 
-    def next(self, here: Motion, there: Motion, *, plain: bool) -> tuple[Motion, Floats]:
-        """Return the next motion, and the plain step in u and v, (2, views) [pixel].
+    def step(self, here: Motion, there: Motion) -> Floats:
+        """Return the plain step in u and v, (2, views) [pixel]."""
+        return (self._as_lengths(there) - self._as_lengths(here))[:2]
+
+    def next(self, here: Motion, there: Motion, *, plain: bool) -> Motion:
+        """Return the next motion.
 
         Parameters
         ----------
@@ -114,11 +122,15 @@ class MotionSteps:
             magnification=np.exp(moved[2] / self._lever) if self._scale else None,
             cause=here.cause,
         )
-        return motion.normalised(), (end - start)[:2]
+        return motion.normalised()
 
     def restart(self) -> None:
         """Go on at another level, see :meth:`Anderson.restart`."""
         self._anderson.restart()
+
+    def forget(self) -> None:
+        """Go on as if nothing were known of earlier steps."""
+        self._anderson.forget()
 
     def _as_lengths(self, motion: Motion) -> Floats:
         rows = [motion.shift_u, motion.shift_v]

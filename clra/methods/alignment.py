@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clra.methods.acceleration import MotionSteps
 from clra.methods.imgr import imgr
 from clra.methods.level import Level
-from clra.methods.limits import warn_of_far_motion, warn_of_lost_features
+from clra.methods.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.multigrid import ReconstructionInterrupted
 from clra.methods.outliers import from_neighbours, odd_radiographs, outliers
 from clra.methods.reference import align_to_reference
@@ -67,9 +67,9 @@ def align(
         drift against a reference scan alone, without any reconstruction.
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
-        panel of 384 pixels and more "6ER-3QR-1HR", else a quarter of the resolution until converged
-        (at most 6 iterations), then half (at most 3). For "imgr" the
-        levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
+        panel of 384 pixels and more "6ER-3QR", else a quarter of the resolution until converged (at
+        most 6 iterations), then half until converged (at most 3, often one). For "imgr" the levels
+        of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
         source that moved, in all three directions: this explains the parallax by which what is
@@ -209,6 +209,8 @@ class _Run:
     history: list[Iteration] = field(init=False, default_factory=list)
     registered: Registered = field(init=False)
     found: Motion = field(init=False)  # by the last iteration, with its gauge
+    last: tuple[int, Floats] = field(init=False)  # its level, and updates of views believed
+    fresh: bool = field(init=False)  # nothing was known of the motion before it
     weak: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -251,7 +253,8 @@ class _Run:
                 # in the modes that data hardly see, a tenth of all that is left of random motion.
                 self.weak, level.bias = self.weak | wrong, None
                 found = self._iterate(level, title=of)
-            update_u, update_v = update = np.abs(self._move(found))
+            step, note = self._move(found, stage.level)
+            update = np.abs(step)
             self.history.append(
                 Iteration.of(
                     name,
@@ -260,18 +263,20 @@ class _Run:
                     found.correlation,
                     found.residual,
                     time.perf_counter() - started,
+                    note=note,
                     **self._errors(),
                 )
             )
-            if len(self.history) == 1:
-                warn_of_far_motion(found.motion, stage.level, name)
-            # 6, 13: until converged
+            # 6, 13: until converged, whatever becomes of views that are not believed
+            update_u, update_v = update[:, ~self.weak]
             if stage.iterations is None and converged(update_u, update_v, previous):
                 break
-            # The first of all finds too little, see `_move`: the second may well find as much.
-            previous = None if len(self.history) == 1 else update_size(update_u, update_v)[0]
+            # A first step finds too little, see `_move`: the second may well find as much.
+            previous = None if self.fresh else update_size(update_u, update_v)[0]
         if len({entry.level for entry in self.history}) == 1:
-            warn_of_lost_features(self.scan, found.correlation, stage.level, name)
+            note = warned(lost_features(self.scan, found.correlation, stage.level))
+            notes = filter(None, (self.history[-1].note, note))
+            self.history[-1] = replace(self.history[-1], note="\n".join(notes))
 
     def _iterate(self, level: Level, *, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""
@@ -287,16 +292,31 @@ class _Run:
             title=title,
         )
 
-    def _move(self, found: Registered) -> Floats:
-        """Algorithm 1, step 5: append what was found; returns the plain step in u and v."""
+    def _move(self, found: Registered, level: int) -> tuple[Floats, str]:
+        """Algorithm 1, step 5: append what was found.
+
+        Returns the plain step in u and v, and what was warned of.
+        """
         self.registered = found
         self.weak = outliers(found.correlation)
         self.found = from_neighbours(self.motion.then(found.motion), self.weak).normalised()
         there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
-        # The first step's reconstruction was blurred, and what it registered is not all that later
+        step = self.steps.step(self.motion, there)
+        believed = np.abs(step[:, ~self.weak])
+        if self.history:
+            note = warned(false_shifts(*self.last, level, believed))
+            self.fresh = bool(note)
+        else:
+            note = warned(far_motion(found.motion, level))
+            self.fresh = True
+        if self.fresh:
+            # What the steps so far tell of slow modes is as wrong as where they led.
+            self.steps.forget()
+        self.last = level, believed
+        # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
-        self.motion, step = self.steps.next(self.motion, there, plain=not self.history)
-        return step
+        self.motion = self.steps.next(self.motion, there, plain=self.fresh)
+        return step, note
 
     @property
     def _shifts_first(self) -> bool:

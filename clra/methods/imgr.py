@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods.limits import far_motion, lost_features, warned
 from clra.methods.multigrid import (
     MultigridResult,
     Progressed,
@@ -197,7 +198,7 @@ class _Run:
             motion,
             weak,
             (*self.done.steps, step),
-            self.done.history if found is None else self._history(step, motion, found),
+            self.done.history if found is None else self._history(step, motion, found, level),
         )
 
     def _so_far(self, level: MultigridLevel) -> Volume:
@@ -217,7 +218,14 @@ class _Run:
         motion = gauge.anchored(self.found, start) if self.anchor else self.found
         return motion.normalised(), weak
 
-    def _history(self, step: Step, motion: Motion, found: Registered) -> tuple[Iteration, ...]:
+    def _history(
+        self, step: Step, motion: Motion, found: Registered, level: MultigridLevel
+    ) -> tuple[Iteration, ...]:
+        """Append what a registration did; warn if it says that it had better not."""
+        far = "" if self.done.history else far_motion(found.motion, level.factor)
+        # Noise may well hide at full resolution what coarser ones could tell.
+        told = level.factor > 1 and step.cycle == 1
+        lost = lost_features(self.scan, found.correlation, level.factor) if told else ""
         before = self.done.motion
         update = [motion.shift_u - before.shift_u, motion.shift_v - before.shift_v]
         errors = {} if self.truth is None else self.gauge.error(motion, self.truth).means()
@@ -229,6 +237,7 @@ class _Run:
             found.residual,
             step.seconds,
             misfit=step.misfit,
+            note=warned(far, lost),
             **errors,
         )
         return (*self.done.history, iteration)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,8 @@ class Iteration:
         Mean absolute errors after the iteration where the truth is known.
     misfit : float or None
         Of iterative reconstruction: mean Poisson deviance of a ray before the volume's update.
+    note : str
+        What was warned of, a line each: motions out of reach, features that the level loses.
     """
 
     level: str
@@ -51,6 +54,7 @@ class Iteration:
     gauge_free_v: float | None = None
     gauge_free_m: float | None = None
     misfit: float | None = None
+    note: str = ""
 
     @classmethod
     def of(
@@ -61,7 +65,7 @@ class Iteration:
         correlation: Floats,
         residual: Floats,
         seconds: float,
-        **more: float,
+        **more: Any,
     ) -> "Iteration":
         """Sum an iteration up; of `update`, (2, views), the size counts."""
         size = np.abs(update)

@@ -20,13 +20,13 @@ _EXPECTED = (
 # pixels. A fixed number of iterations does: they cost next to nothing there, and slow modes
 # (magnification and v that drift together along the scan) need them. By the paper's count, an
 # eighth 1/64 and a quarter 1/16 of an iteration, two more at the one and one at the other for what
-# displaces their re-projections, it is 0.625, as 2QR-2HR.
+# displaces their re-projections, it is 0.625, as 2QR-2HR, where one at half the resolution will do.
 _SMALLEST = 48
-_LARGE = ((8, 6), (4, 3), (2, 1))
+_LARGE = (8, 6), (4, 3)
 
 # Iterations after which "until converged" gives up: plain re-projection alignment of a slow, smooth
 # motion gains less than a tenth of its error in each further one. Three at half the resolution:
-# spheres need one, a sandstone whose grains are 4 pixels wide at a quarter needs two or three.
+# spheres need one, a sandstone whose grains are 2 to 4 pixels wide at a quarter two or three.
 _LIMIT, _LIMIT_AT_HALF = 6, 3
 
 # Median and largest shift update that count as converged [pixel of the full-resolution panel]: the
@@ -106,9 +106,9 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
     Parameters
     ----------
     text : str
-        Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto": "6ER-3QR-1HR" for
-        large panels, for others quarter resolution until converged (at most 6 iterations), then
-        half (at most 3).
+        Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto":
+        "6ER-3QR" for large panels, for others quarter resolution until converged (at most 6
+        iterations), then half until converged (at most 3).
     shape : (int, int)
         Rows and columns of the panel, for "auto": large is from 384 on.
 
@@ -123,9 +123,10 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
         If the text is no schedule; the message says what one looks like.
     """
     if text == "auto":
+        stages = [Stage(_LEVELS["QR"], None, _LIMIT)]
         if min(shape) // 8 >= _SMALLEST:
-            return tuple(Stage(level, count, count) for level, count in _LARGE)
-        return Stage(_LEVELS["QR"], None, _LIMIT), Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF)
+            stages = [Stage(level, count, count) for level, count in _LARGE]
+        return *stages, Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF)
     stages = []
     for part in str(text).upper().split("-"):
         match = _STAGE.fullmatch(part)

@@ -47,7 +47,7 @@ def result(scan: Scan) -> AlignmentResult:
             magnification=truth.magnification,
         ),
         history=[
-            Iteration("QR", 1, 1.5, 1.4, 3.9, 0.8, 0.05, 2.0),
+            Iteration("QR", 1, 1.5, 1.4, 3.9, 0.8, 0.05, 2.0, note="few features\n3 < 4 views"),
             Iteration("HR", 1, 0.2, 0.1, 0.4, 0.9, 0.04, 8.0, 0.1, 0.1, 1e-4, 0.05, 0.05, 1e-4),
         ],
         confidence=confidence,

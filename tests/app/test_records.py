@@ -49,6 +49,17 @@ def test_the_file_is_the_one_that_others_read(motion_file, record):
         assert file.attrs["schedule"] == "1QR-1HR"
 
 
+def test_a_history_without_what_may_be_missing_is_read(motion_file, record):
+    with h5py.File(motion_file, "a") as file:
+        del file["history/note"], file["history/misfit"]
+    loaded = Record.load(motion_file)
+    assert [dataclasses.replace(step, note="") for step in record.history] == [*loaded.history]
+    assert record.notes == ("few features", "3 < 4 views") and loaded.notes == ()
+    with h5py.File(motion_file, "a") as file:
+        del file["history/residual"]
+    assert Record.load(motion_file).history == ()
+
+
 def test_a_file_of_shifts_alone_is_enough(record, tmp_path):
     write_motion_file(tmp_path / "bare.h5", record.motion)
     bare = Record.load(tmp_path / "bare.h5")

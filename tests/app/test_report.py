@@ -74,6 +74,7 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page):
 def test_the_page_tells_all_there_is(page, record):
     for part in (
         "Alignment of tiny",
+        "<p>few features</p>\n<p>3 &lt; 4 views</p>",
         "Correction of each radiograph",
         "the inverse of the estimated motion",
         "Convergence",
@@ -116,7 +117,7 @@ def test_a_motion_alone_makes_a_page(tmp_path):
     bare = Record(Motion.identity(5), np.ones(5))
     write_report(tmp_path / "r.html", Findings(bare))
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "--scan SCAN" in page and "Convergence" not in page
+    assert "--scan SCAN" in page and "Convergence" not in page and "Warnings" not in page
     assert [file.name for file in tmp_path.iterdir()] == ["r.html"]
 
 

@@ -60,6 +60,7 @@ def test_alignment_takes_what_is_predicted(panel, level, budget, monkeypatch):
     assert need.device <= streams[0].budgets.device
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("budget", [None, 12 * MIB])
 def test_multigrid_takes_what_is_predicted(budget):
     scan = _scan()

@@ -21,7 +21,7 @@ def test_text_becomes_stages(text, stages):
 
 
 def test_auto_begins_at_an_eighth_where_that_leaves_something():
-    assert [str(stage) for stage in parse_schedule("auto", (928, 512))] == ["6ER", "3QR", "1HR"]
+    assert [str(stage) for stage in parse_schedule("auto", (928, 512))] == ["6ER", "3QR", "HR"]
     assert parse_schedule("auto", (928, 300)) == parse_schedule("auto")
     assert parse_schedule("1QR", (928, 512)) == parse_schedule("1QR")
 
