@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
+from clra.methods.gaps import without_gaps
 from clra.methods.imgr import imgr
 from clra.methods.katsevich import exact_helices, katsevich
 from clra.model.grid import VolumeGrid, default_grid
@@ -32,7 +33,7 @@ class Slicer:
     level : int
         Binning factor to reconstruct at.
     believed : ndarray of bool, (views,), optional
-        Views for the slices after correction, all by default; Katsevich's method needs all.
+        Views for the slices after correction, all by default.
 
     Attributes
     ----------
@@ -50,22 +51,25 @@ class Slicer:
         level: int,
         believed: NDArray[np.bool_] | None = None,
     ) -> None:
-        whole = default_grid(scan.geometry)
-        self.grid = whole.binned(level) if level > 1 else whole
+        grid = default_grid(scan.geometry)
+        self.grid = grid.binned(level) if level > 1 else grid
         self._stream, self._believed = stream, believed
         self._radiographs = Radiographs(stream, scan, level)
         before, after = scan.geometry, scan.geometry.with_motion(motion)
         self._geometries = [g.binned(level) if level > 1 else g for g in (before, after)]
+        if level > 1:
+            scan = Scan(self._radiographs, self._geometries[0])
         try:
-            exact_helices(self._radiographs, self._geometries[0], self.grid)
+            whole = without_gaps(scan)
+            helical = Radiographs(stream, whole, 1)
+            exact_helices(helical, whole.geometry, self.grid)
         except ValueError:
             self.method = "ramp-filtered back-projection"
             return
         self.method = "Katsevich's method"
-        if level > 1:
-            scan = Scan(self._radiographs, self._geometries[0])
         ideal = corrected(stream, scan, _at_level(motion, before.shape, level))
-        self._corrected = Radiographs(stream, ideal, 1)
+        self._helical = helical, Radiographs(stream, without_gaps(ideal, believed), 1)
+        self._geometries = [whole.geometry] * 2
 
     def images(self, plane: VolumeGrid) -> tuple[Image, Image]:
         """Reconstruct a slice before and after correction.
@@ -90,7 +94,7 @@ class Slicer:
         else:
             volumes = [
                 katsevich(stream, radiographs, before, plane, stage=stage)
-                for radiographs in (self._radiographs, self._corrected)
+                for radiographs in self._helical
             ]
         without, corrected_one = (_upright(volume.to_host()) for volume in volumes)
         return without, corrected_one

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from clra.methods.outliers import odd, sums_of
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.helix import Helix
@@ -133,7 +134,8 @@ def exact_helices(radiographs: Radiographs, geometry: ConeBeamGeometry, grid: Vo
     Parameters
     ----------
     radiographs, geometry, grid
-        As :func:`katsevich` takes them. A few radiographs are read.
+        As :func:`katsevich` takes them. A few radiographs are read; of these, any that differ much
+        in mean or contrast say nothing: a dark one would be a sample that is too wide.
 
     Returns
     -------
@@ -178,10 +180,12 @@ def _refuse_wide_sample(
     border = math.tan(helix.fan(radius))
     tangent = helix.tangent_u(np.arange(helix.shape[1]))
     rows = slice(*helix.window_rows(radius))
-    chosen = np.unique(np.linspace(views.start, views.stop - 1, _PROBED).astype(int))
-    profiles = np.stack(
-        [radiographs.read(slice(view, view + 1))[0, rows].mean(axis=0) for view in chosen]
-    )
+    probed, sums = [], []
+    for view in np.unique(np.linspace(views.start, views.stop - 1, _PROBED).astype(int)):
+        image = radiographs.read(slice(view, view + 1))
+        probed.append(image[0, rows].mean(axis=0))
+        sums.append(sums_of(image)[:, 0])
+    profiles = np.stack(probed)[~odd(np.stack(sums, axis=1))]
     inside = np.flatnonzero(np.abs(tangent) <= border)
     borders = profiles[:, inside[[0, -1]]].max(axis=1)
     worst = int(borders.argmax())

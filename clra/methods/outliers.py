@@ -49,15 +49,30 @@ def odd_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np.bool
     views = radiographs.shape[0]
     sums = np.empty((2, views))
     for chunk in stream.chunks(views, radiographs.view_bytes):
-        images = radiographs.read(chunk)
-        sums[0, chunk] = images.mean(axis=(1, 2), dtype=np.float64)
-        sums[1, chunk] = images.std(axis=(1, 2), dtype=np.float64)
-    odd = np.zeros(views, np.bool_)
+        sums[:, chunk] = sums_of(radiographs.read(chunk))
+    return odd(sums)
+
+
+def sums_of(images: NDArray[np.float32]) -> Floats:
+    """Return mean and standard deviation of each of some images, (2, views)."""
+    axes = (1, 2)
+    return np.stack([images.mean(axes, dtype=np.float64), images.std(axes, dtype=np.float64)])
+
+
+def odd(sums: Floats) -> NDArray[np.bool_]:
+    """Find what :func:`odd_radiographs` does from what :func:`sums_of` gives.
+
+    Parameters
+    ----------
+    sums : ndarray, (2, views)
+        Of views in order; they need not be all.
+    """
+    found = np.zeros(sums.shape[1], np.bool_)
     for values in sums:
         near = median_filter(values, size=_NEIGHBOURS, mode="nearest")
         least = _ODD * abs(float(np.median(values)))
-        odd |= _far(values, np.median(values), least) & _far(values, near, least)
-    return odd if odd.sum() < views / 2 else np.zeros(views, np.bool_)
+        found |= _far(values, np.median(values), least) & _far(values, near, least)
+    return found if found.sum() < len(found) / 2 else np.zeros(len(found), np.bool_)
 
 
 def _far(values: Floats, expected: Floats | np.floating, least: float) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from clra.methods import iterative
 from clra.methods.alignment import align as align_scan
 from clra.methods.correction import corrected
 from clra.methods.fbp import ramp_fbp
+from clra.methods.gaps import without_gaps
 from clra.methods.katsevich import Exact, exact_helices, katsevich
 from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
@@ -60,8 +61,9 @@ def reconstruct(
         As :func:`clra.ops.devices.choose_device` takes it, or "all" to share the work out to all
         devices of the best kind; alignment and iterative methods take the first of them.
     believed : ndarray of bool, (views,), optional
-        Views to reconstruct from, such as ``result.confidence > 0``; all by default, and with
-        "katsevich", which needs every view. With `align` those that are not flagged.
+        Views to reconstruct from, such as ``result.confidence > 0``; all by default, with `align`
+        those that are not flagged. "katsevich" needs every view: what lies between the radiographs
+        beside stands in for the others, and for views that the scan lacks.
     progress : callable, optional
         Called with a :class:`clra.ops.streaming.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
@@ -155,27 +157,33 @@ def reconstruct_into(
     if method == "katsevich":
         # What it cannot treat it refuses before the long work.
         stream = Stream(devices[0], **limits)
-        fitted = exact_helices(Radiographs(stream, scan, 1), scan.geometry, grid)
+        whole = without_gaps(scan, believed)
+        fitted = exact_helices(Radiographs(stream, whole, 1), whole.geometry, grid)
     if align and method != "imgr":
         aligned = align_scan(scan, device=devices[0], progress=progress, **limits)
         motion = aligned.motion
         believed = all_but(aligned.flagged, scan.views)
-    if method == "katsevich" and believed is not None and not believed.all():
-        warnings.warn(
-            f"katsevich needs every view: {(~believed).sum()} that are not believed are used, too",
-            stacklevel=2,
-        )
+    if fitted is not None:
+        there = scan.views if believed is None else int(believed.sum())
+        needed = sum(views.stop - views.start for views, _ in fitted[0])
+        if there < needed:
+            warnings.warn(
+                f"katsevich needs every view: {needed - there} of {needed} that are missing or not "
+                "believed are interpolated from those beside",
+                stacklevel=2,
+            )
     if method in iterative.METHODS:
         stream = Stream(devices[0], report=progress, **limits)
         iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)
         return
 
     def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
-        if method == "katsevich":
+        if fitted is not None:
             ideal = scan if motion is None else corrected(stream, scan, motion)
-            radiographs = Radiographs(stream, ideal, 1)
+            whole = without_gaps(ideal, believed)
+            radiographs = Radiographs(stream, whole, 1)
             part = grid.slab(planes.start, planes.stop)
-            katsevich(stream, radiographs, scan.geometry, part, fitted=fitted, target=target)
+            katsevich(stream, radiographs, whole.geometry, part, fitted=fitted, target=target)
         else:
             geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
             radiographs = Radiographs(stream, scan, 1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import clra
+from clra.model.grid import default_grid
 from clra.model.phantom import Ellipsoids
 
 BODY = Ellipsoids([[0, 0, 0], [0.2, 0.1, 0]], [[0.6, 0.6, 0.5], [0.1, 0.2, 0.1]], [1.0, 0.5])
@@ -47,9 +48,24 @@ def test_aligning_on_the_way_finds_them_out(scan):
     assert np.sqrt(np.mean((bad - good) ** 2)) < 0.05
 
 
-def test_katsevich_needs_every_view_and_says_so(scan):
-    with pytest.warns(UserWarning, match="katsevich needs every view: 3 that are not believed"):
-        clra.reconstruct(scan, "katsevich", believed=BELIEVED)
+@pytest.mark.parametrize("value", [0.0, 9.0])
+def test_katsevich_puts_what_lies_between_in_place_of_them(scan, value):
+    whole = clra.reconstruct(scan, "katsevich")
+    spoilt = _spoilt(scan, value)  # 9 at the border would be a sample too wide
+    with pytest.warns(UserWarning, match="katsevich needs every view: 3 of 121 that are missing"):
+        found = clra.reconstruct(spoilt, "katsevich", believed=BELIEVED)
+    used = clra.reconstruct(spoilt, "katsevich")
+
+    def rms(volume):
+        return np.sqrt(np.mean((volume - whole) ** 2))
+
+    assert rms(found) < 0.05 * rms(used)
+    assert rms(found) < 0.001
+    missing = clra.Scan(scan.read(0, scan.views)[BELIEVED], scan.geometry.subset(BELIEVED))
+    grid = default_grid(scan.geometry)
+    with pytest.warns(UserWarning, match="needs every view: 3 of 121"):
+        again = clra.reconstruct(missing, "katsevich", grid)
+    assert rms(again) == pytest.approx(rms(found), rel=0.01)
 
 
 @pytest.mark.parametrize("believed", [np.ones(7, np.bool_), np.zeros(121, np.bool_)])
