@@ -34,6 +34,13 @@ def align(
             help="Reference scan: some views again, taken so quickly that nothing moved.",
         ),
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MOTION.h5",
+            help="Motion to start from, of a run that was interrupted or shall be refined.",
+        ),
+    ] = None,
     autofocus: Annotated[
         bool,
         typer.Option(
@@ -81,6 +88,7 @@ def align(
     --------
       clra align scan.nxs -o motion.h5
       clra align scan.nxs -o motion.h5 --schedule 1QR-1HR --report report.html
+      clra align scan.nxs -o finer.h5 --start motion.h5 --schedule 1HR
       clra align scan.nxs -o motion.h5 --method imgr --volume volume.h5
       clra align scan.nxs -o motion.h5 --reference quick.nxs
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
@@ -89,7 +97,7 @@ def align(
     from clra.app.arguments import volume_file
     from clra.app.errors import InterruptedCommandError
     from clra.app.findings import Errors, findings_of, summary_of
-    from clra.app.outputs import focus_attributes
+    from clra.app.outputs import focus_attributes, matched
     from clra.app.records import Record
     from clra.io.atomic import ensure_writable
     from clra.io.volumes import write_volume
@@ -104,12 +112,18 @@ def align(
         if method != "imgr":
             raise ValueError(f"--volume: found it with --method {method}, expected imgr")
         volume_file(volume)
+    if start is not None and (autofocus or reference is not None):
+        other = "--autofocus" if autofocus else "--reference"
+        raise ValueError(f"--start, {other}: found both, expected one of them")
     limits = memory.limits()
     for path in (out, report, volume):
         if path is not None:
             ensure_writable(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
+    earlier = None if start is None else Record.load(start)
+    if earlier is not None and start is not None:
+        opened = matched(opened, earlier, start)
     about = {
         "file": str(scan.absolute()),
         "estimate": estimate,
@@ -117,6 +131,7 @@ def align(
         "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
         f"--estimate {estimate} --gauge {gauge}"
         f"{'' if reference is None else f' --reference {reference}'}"
+        f"{'' if start is None else f' --start {start}'}"
         f"{' --autofocus' if autofocus else ''}{reading.as_typed()}",
     }
     with console.progress() as progress:
@@ -133,18 +148,20 @@ def align(
                 estimate=estimate,
                 gauge=gauge,
                 reference=still,
+                motion=None if earlier is None else earlier.motion,
                 device=console.device,
                 progress=progress,
                 **limits,
             )
         except AlignmentInterrupted as stopped:
-            record = Record.of(stopped.result, opened, interrupted="yes", **about)
+            record = Record.of(stopped.result, opened, earlier, interrupted="yes", **about)
             record.save(out)
             last = record.history[-1]
             raise InterruptedCommandError(
-                f"{out} keeps what {len(record.history)} iterations gave, the last at {last.level}"
+                f"{out} keeps what {len(record.history)} iterations gave, the last at "
+                f"{last.level}; --start {out} goes on from there"
             ) from None
-        record = Record.of(result, opened, **about)
+        record = Record.of(result, opened, earlier, **about)
         record.save(out)
         errors = Errors.of(record, opened)
         if volume is not None and result.volume is not None:

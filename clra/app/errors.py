@@ -1,7 +1,9 @@
 """What an error means to the caller of a command: an exit status and one line on stderr."""
 
 import errno
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -42,7 +44,8 @@ def verdict(error: BaseException) -> tuple[int, str]:
     Returns
     -------
     status : int
-        2 for bad input or usage, 1 for a failure of the machine or of clra itself, 130 for Ctrl-C.
+        2 for bad input or usage, 1 for a failure of the machine or of clra itself, 130 for Ctrl-C
+        and SIGTERM.
     line : str
         Without a line break.
     """
@@ -123,6 +126,19 @@ def _plain_warnings() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _ended_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM, which batch systems send before they kill, do what Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # which alone may say what signals do
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 class Group(TyperGroup):
     """Commands whose errors become one line on stderr and an exit status."""
 
@@ -140,7 +156,7 @@ class Group(TyperGroup):
         # Wanted mostly after something failed, so it may be added at either end of the line.
         debug = _DEBUG in given
         try:
-            with _plain_warnings():
+            with _plain_warnings(), _ended_like_ctrl_c():
                 status = super().main(
                     [argument for argument in given if argument != _DEBUG],
                     prog_name or "clra",

@@ -67,7 +67,9 @@ class Record:
         return bool(np.any(self.motion.magnification != 1))
 
     @classmethod
-    def of(cls, result: AlignmentResult, scan: Scan, **about: str) -> "Record":
+    def of(
+        cls, result: AlignmentResult, scan: Scan, earlier: "Record | None" = None, /, **about: str
+    ) -> "Record":
         """Keep a result.
 
         Parameters
@@ -76,15 +78,21 @@ class Record:
             Of the scan.
         scan : Scan
             Three of its radiographs are read for a checksum.
+        earlier : Record, optional
+            Of the run that it started from: its history comes first, and the panel is still where
+            an auto-focus found it then.
         **about : str
             What else is to be remembered.
         """
         u, v, m = np.median(result.sigma, axis=0).tolist()
+        before = () if earlier is None else earlier.history
+        known = {} if earlier is None else earlier.about
+        panel = {name: told for name, told in known.items() if name.startswith("panel_")}
         return cls(
             motion=result.motion,
             confidence=result.confidence,
             flagged=result.flagged,
-            history=tuple(result.history),
+            history=(*before, *result.history),
             gauge=result.gauge,
             sigma=(u, v, m),
             about={
@@ -94,6 +102,7 @@ class Record:
                 "schedule": result.schedule,
                 "device": result.device,
                 **_source_travel(result.motion, scan),
+                **panel,
                 **about,
             },
         )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from clra.app import demo
+from clra.app.records import Record
 from clra.app.simulate import sample
 from clra.io.motions import write_motion_file
 from clra.io.scans import read_scan, write_scan
@@ -235,13 +236,36 @@ def test_align_reconstruct_correct_report(clra, scan_file, tmp_path):
     assert code == 0 and "--scan SCAN" in (tmp_path / "short.html").read_text(encoding="utf-8")
 
 
+def test_alignment_goes_on_from_a_motion(clra, monkeypatch, scan_file, tmp_path):
+    first, last = tmp_path / "first.h5", tmp_path / "last.h5"
+    monkeypatch.setattr("clra.methods.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25))
+    assert clra("align", scan_file, "-o", first, "--schedule", "2HR", "--autofocus")[0] == 0
+    code, out, err = clra(
+        "align", scan_file, "-o", last, "--schedule", "1HR", "--start", first, "--json"
+    )
+    assert code == 0, err
+    begun, ended = Record.load(first), Record.load(last)
+    assert ended.history[:2] == begun.history and len(json.loads(out)["history"]) == 3
+    assert ended.about["panel_tilt"] == begun.about["panel_tilt"] == "0.572958 degree"
+    assert ended.about["command"].endswith(f"--start {first}")
+    # It begins where the other ended: were it at no motion, it would move by most of it again.
+    moved = np.abs(ended.motion.shift_v - begun.motion.shift_v).mean()
+    assert moved < 0.3 * np.abs(begun.motion.shift_v).mean()
+    assert ended.history[2].update_v_median < 0.3 * begun.history[0].update_v_median
+    for option in (["--autofocus"], ["--reference", scan_file]):
+        told = clra("align", scan_file, "-o", last, "--start", first, *option)
+        refused(told, 2, "--start", option[0], "found both")
+    refused(clra("align", scan_file, "-o", last, "--start", tmp_path / "none.h5"), 2, "none.h5")
+
+
 def test_ctrl_c_keeps_the_finished_iterations(clra, monkeypatch, result, scan_file, tmp_path):
     def interrupted(*_, **__):
         raise AlignmentInterrupted(result)
 
     monkeypatch.setattr("clra.methods.alignment.align", interrupted)
     motion = tmp_path / "m.h5"
-    refused(clra("align", scan_file, "-o", motion), 130, "m.h5", "2 iterations", "HR")
+    told = clra("align", scan_file, "-o", motion)
+    refused(told, 130, "m.h5", "2 iterations", "HR", f"--start {motion}")
     with h5py.File(motion) as file:
         np.testing.assert_array_equal(file["motion/shift_u"], result.motion.shift_u)
         assert file.attrs["interrupted"] == "yes"

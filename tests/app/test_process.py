@@ -42,7 +42,8 @@ def test_debug_adds_a_traceback_on_either_side_of_the_command():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals work otherwise there")
-def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_with_130_and_leaves_no_file(sent, tmp_path):
     process = subprocess.Popen(
         [*CLRA, "simulate", str(tmp_path / "s.nxs"), "--views", "3456", "--panel", "928x512"],
         stderr=subprocess.PIPE,
@@ -54,7 +55,7 @@ def test_ctrl_c_ends_with_130_and_leaves_no_file(tmp_path):
     assert process.stderr is not None
     assert process.stderr.readline().startswith("writing: ")
     assert any(tmp_path.iterdir())
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert out == "" and err.splitlines()[-1].startswith("interrupted: ")
