@@ -141,10 +141,8 @@ def import_scan(
       clra import frames.raw --shape 3040x3040 --angles 0:359.5:720 --source-distance 7.07
         --detector-distance 328.5 --pixel-size 0.139 --flat flat.raw -o scan.nxs
     """
-    from clra.io.atomic import ensure_writable
     from clra.io.frames import import_frames
 
-    ensure_writable(out)
     with console.progress() as report:
         import_frames(
             out,

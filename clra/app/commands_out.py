@@ -116,9 +116,12 @@ def align(
         other = "--autofocus" if autofocus else "--reference"
         raise ValueError(f"--start, {other}: found both, expected one of them")
     limits = memory.limits()
-    for path in (out, report, volume):
+    ensure_writable(out, keep=(scan, reference))  # it may be --start: that is read by then
+    kept = [scan, reference, start, out]
+    for path in (report, volume):
         if path is not None:
-            ensure_writable(path)
+            ensure_writable(path, kept)
+            kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
     earlier = None if start is None else Record.load(start)
@@ -218,7 +221,7 @@ def correct(
     opened = reading.scan(scan)
     opened, known, believed = motion_for(opened, motion)
     views, rows, columns = opened.shape
-    room_for(out, 4 * views * rows * columns)
+    room_for(out, 4 * views * rows * columns, keep=(scan, motion))
     with console.progress() as progress:
         corrected = correct_scan(opened, known, console.device, **limits)
         write_scan(out, corrected, believed=believed, progress=progress)
@@ -262,7 +265,7 @@ def report(
 
     limits = memory.limits()
     record = Record.load(motion)
-    ensure_writable(out)
+    ensure_writable(out, keep=(motion, scan))
     opened = None if scan is None else reading.scan(scan)
     if opened is not None:
         opened = matched(opened, record, motion)

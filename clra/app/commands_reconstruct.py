@@ -122,14 +122,16 @@ def reconstruct(
     options = iterating.options()
     opened = reading.scan(scan)
     grid = default_grid(opened.cropped().geometry)
+    initial = None
     if options.get("initial") not in (None, "fbp", "uniform"):
-        options["initial"] = _start(Path(options["initial"]), grid)
+        initial = Path(options["initial"])
+        options["initial"] = _start(initial, grid)
     sorted_options(method, options)
     known = believed = None
     if motion is not None:
         opened, known, believed = motion_for(opened, motion)
     nz, ny, nx = grid.shape
-    room_for(out, 4 * nz * ny * nx)
+    room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
     steps: tuple[Step, ...] = ()
     with console.progress() as progress:
         if method == "imgr":

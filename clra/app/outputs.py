@@ -5,7 +5,7 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,9 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 
 
-def room_for(path: str | os.PathLike[str], size: int) -> None:
+def room_for(
+    path: str | os.PathLike[str], size: int, keep: Iterable[str | os.PathLike[str] | None] = ()
+) -> None:
     """Check that a file of that many bytes can be written.
 
     Parameters
@@ -31,13 +33,17 @@ def room_for(path: str | os.PathLike[str], size: int) -> None:
         Where to.
     size : int
         Bytes.
+    keep : iterable of path-like or None
+        Files that it must not replace.
 
     Raises
     ------
+    InputError
+        If it would replace one of `keep`.
     OutputError
         If the folder is no place to write or its disk is too full.
     """
-    ensure_writable(path)
+    ensure_writable(path, keep)
     free = shutil.disk_usage(Path(path).absolute().parent).free
     if free < size:
         found = f"{free / 1e9:.3g} GB free of {size / 1e9:.3g} GB wanted"

@@ -6,11 +6,11 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from clra.io.errors import OutputError
+from clra.io.errors import InputError, OutputError
 
 # HDF5 tells the system's errno only inside its message.
 _HDF5_ERRNO = re.compile(r"errno = (\d+)")
@@ -60,20 +60,31 @@ def atomic_path(path: str | os.PathLike[str], size: int = 0) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def ensure_writable(path: str | os.PathLike[str]) -> None:
+def ensure_writable(
+    path: str | os.PathLike[str], keep: Iterable[str | os.PathLike[str] | None] = ()
+) -> None:
     """Check before a long computation that `path` can be written; nothing is left behind.
 
     Parameters
     ----------
     path : path-like
         Where a file is to appear later.
+    keep : iterable of path-like or None
+        Files that it must not replace: those that are read, and other results. None is no file.
 
     Raises
     ------
+    InputError
+        If it would replace one of `keep`.
     OutputError
-        If it cannot.
+        If it cannot be written.
     """
     target = _target(path)
+    if any(other is not None and Path(os.path.realpath(other)) == target for other in keep):
+        raise InputError(
+            f"cannot write {os.fspath(path)}: it is what is read, or another result: give another "
+            "name"
+        )
     probe = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         probe.touch()

@@ -9,6 +9,7 @@ from contextlib import ExitStack, closing
 import numpy as np
 from numpy.typing import ArrayLike
 
+from clra.io.atomic import ensure_writable
 from clra.io.errors import InputError
 from clra.io.nxgeometry import Fields, far_source_distance
 from clra.io.nxtomo_writing import write_nxtomo
@@ -99,6 +100,10 @@ def import_frames(
         if stack is None:
             raise InputError("frames: found no file, expected at least one")
         stacks = [part for part in (stack, bright, dark) if part is not None]
+        tables = [
+            given for given in (angles, z_translation) if isinstance(given, str | os.PathLike)
+        ]
+        ensure_writable(out, keep=[*tables, *(file for part in stacks for file in part.files)])
         for part in stacks:
             if part.shape[1:] != stack.shape[1:]:
                 found = f"{part.shape[1:]} pixels"

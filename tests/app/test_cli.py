@@ -2,11 +2,14 @@
 
 import json
 import re
+import shutil
 from functools import partial
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import tifffile
 
 from clra.app import demo
 from clra.app.records import Record
@@ -281,11 +284,36 @@ def test_ctrl_c_before_that_leaves_nothing(clra, monkeypatch, scan_file, tmp_pat
 
 
 def test_a_full_disk_is_noticed_before_work(clra, monkeypatch, scan_file, tmp_path):
-    import shutil
-
     full = shutil._ntuple_diskusage(100, 99, 1)
     monkeypatch.setattr("clra.app.outputs.shutil.disk_usage", lambda path: full)
     refused(clra("reconstruct", scan_file, "-o", tmp_path / "v.h5"), 1, "v.h5", "free some space")
+
+
+@pytest.mark.filterwarnings("ignore:.*other radiographs")
+def test_nothing_that_is_read_is_overwritten(clra, scan_file, motion_file, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(scan_file, "scan.nxs")
+    Path("link.nxs").symlink_to("scan.nxs")
+    tifffile.imwrite("frame.tif", np.ones((2, 4, 6), np.uint16))
+    Path("angles.txt").write_text("0\n90\n")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    motion, scanner = ("--motion", motion_file), ("--pixel-size", 1, "--parallel")
+    for arguments in (
+        ("align", "scan.nxs", "-o", "scan.nxs"),
+        ("align", "scan.nxs", "-o", "link.nxs"),
+        ("align", "scan.nxs", "-o", "m.h5", "--reference", "link.nxs", "--report", "./link.nxs"),
+        ("align", "scan.nxs", "-o", "m.h5", "--report", tmp_path / "m.h5"),
+        ("align", "scan.nxs", "-o", "m.h5", "--start", motion_file, "--report", motion_file),
+        ("correct", "scan.nxs", *motion, "-o", "scan.nxs"),
+        ("correct", "scan.nxs", *motion, "-o", motion_file),
+        ("reconstruct", "scan.nxs", *motion, "-o", motion_file),
+        ("report", motion_file, "-o", motion_file),
+        ("report", motion_file, "--scan", "scan.nxs", "-o", "scan.nxs"),
+        ("import", "frame.tif", "--angles", "0:90:2", *scanner, "-o", "frame.tif"),
+        ("import", "frame.tif", "--angles", "angles.txt", *scanner, "-o", "angles.txt"),
+    ):
+        refused(clra(*arguments), 2, "cannot write", "give another name")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.filterwarnings("default")
