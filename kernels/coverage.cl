@@ -2,8 +2,9 @@
 //
 // W(x) = sum over views of the view's weight times that of the row that x falls on, linear between
 // rows, 0 for a view on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It
-// varies over many voxels, so that it is computed once for a block of them and interpolated
-// linearly.
+// varies over many voxels, so that it is computed once for a block of them, in its middle, and
+// interpolated linearly. The last block of an axis may be cut short by the grid's end: its middle
+// is `last` in units of whole blocks, at most their number less 1.
 //
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
 // normalise one a voxel, along the volume's axes from last to first.
@@ -20,6 +21,9 @@ kernel void coverage(
     const int nx, // coarse voxels
     const int ny,
     const int nz,
+    const float last_x, // middles of the last coarse voxels
+    const float last_y,
+    const float last_z,
     const int columns, // pixels; at least 2, as are rows
     const int rows,
     const int views)
@@ -31,12 +35,13 @@ kernel void coverage(
     const int k = get_global_id(0), i = get_global_id(1), j = get_global_id(2);
     if (k >= nz || i >= nx || j >= ny)
         return;
+    const float x = min((float)i, last_x), y = min((float)j, last_y), z = min((float)k, last_z);
     float sum = 0.0f;
     for (int view = 0; view < views; ++view) {
         global const float *m = matrices + 12 * view;
-        const float a = m[0] * i + m[1] * j + m[2] * k + m[3];
-        const float b = m[4] * i + m[5] * j + m[6] * k + m[7];
-        const float g = m[8] * i + m[9] * j + m[10] * k + m[11];
+        const float a = m[0] * x + m[1] * y + m[2] * z + m[3];
+        const float b = m[4] * x + m[5] * y + m[6] * z + m[7];
+        const float g = m[8] * x + m[9] * y + m[10] * z + m[11];
         const float column = a / g, row = b / g;
         // Written so that a NaN is not on the panel.
         const int on = g > 0.0f && column >= 0.0f && column <= columns - 1.0f && row >= 0.0f &&
@@ -51,11 +56,12 @@ kernel void coverage(
 
 // Where a voxel lies between the middles of coarse ones: index of the lower, and how far on; beyond
 // the outermost middles the fraction goes beyond 0 and 1, which continues W along its slope.
-static inline int between(const int index, const float inverse, const int coarse, float *fraction)
+static inline int between(
+    const int index, const float inverse, const int coarse, const float last, float *fraction)
 {
     const float at = (index + 0.5f) * inverse - 0.5f;
     const int low = clamp((int)at, 0, max(coarse - 2, 0));
-    *fraction = coarse > 1 ? at - low : 0.0f;
+    *fraction = coarse > 1 ? (at - low) / (min(low + 1.0f, last) - low) : 0.0f;
     return low;
 }
 
@@ -71,6 +77,9 @@ kernel void normalise(
     const int coarse_x, // coarse voxels
     const int coarse_y,
     const int coarse_z,
+    const float last_x, // middles of the last coarse voxels
+    const float last_y,
+    const float last_z,
     const float inverse_xy, // 1 / (voxels in a coarse one), along x and y
     const float inverse_z,
     const float axis_x, // index along x and y at which the rotation axis lies
@@ -87,9 +96,9 @@ kernel void normalise(
     if (i >= nx || j >= ny || k >= nz)
         return;
     float fx, fy, fz;
-    const int x = between(i, inverse_xy, coarse_x, &fx);
-    const int y = between(j, inverse_xy, coarse_y, &fy);
-    const int z = between(first + k, inverse_z, coarse_z, &fz);
+    const int x = between(i, inverse_xy, coarse_x, last_x, &fx);
+    const int y = between(j, inverse_xy, coarse_y, last_y, &fy);
+    const int z = between(first + k, inverse_z, coarse_z, last_z, &fz);
     const size_t right = min(x + 1, coarse_x - 1) - x, up = min(z + 1, coarse_z - 1) - z;
     const size_t back = min(y + 1, coarse_y - 1) - y;
     global const float *w = seen + ((size_t)y * coarse_x + x) * coarse_z + z;

@@ -11,13 +11,15 @@ from pyopencl.array import Array
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops import opencl
+from clra.ops.filtering import FADE
 from clra.ops.scratch import Allocator, Scratch
 from clra.ops.steps import Step, to_device
 from clra.ops.views import check_geometry, view_weights
 
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
 # rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
-# twentieth of a back-projection.
+# twentieth of a back-projection. Where that tenth is less than _ALONG voxels, half or a quarter are
+# in a coarse one: with 4, a panel of 5 rows would see its middle plane 14 % too bright.
 _ACROSS, _ALONG = 8, 4
 # A voxel with less than this part of the most views that see the axis is set to zero: a handful of
 # views gives streaks, not a reconstruction.
@@ -85,8 +87,16 @@ class Coverage:
         self._counted = (geometry.views, geometry.rows, geometry.columns)
         # One row or column is as good as two alike.
         self._panel = (max(geometry.columns, 2), max(geometry.rows, 2))
-        nz, ny, nx = grid.shape
-        self._coarse = (-(-nx // _ACROSS), -(-ny // _ACROSS), -(-nz // _ALONG))
+        pixel = np.linalg.norm(geometry.v, axis=1) * geometry.source_to_axis
+        fade = FADE * geometry.rows * abs(np.median(pixel / geometry.source_to_detector))
+        along = next((n for n in (_ALONG, _ALONG // 2) if fade >= n * grid.voxel_size), 1)
+        sizes = self._blocks = np.array([_ACROSS, _ACROSS, along])
+        voxels = np.array(grid.shape[::-1])
+        coarse = -(-voxels // sizes)
+        self._coarse = (int(coarse[0]), int(coarse[1]), int(coarse[2]))
+        # The last one ends where the grid does: beyond that there may be no view at all.
+        middles = 0.5 * ((coarse - 1) * sizes + voxels - 1)
+        self._last_middles = ((middles - 0.5 * (sizes - 1)) / sizes).tolist()
         self._row_weight, self._circle = weights, circle
         self._weights = to_device(context, np.resize(weights, self._panel[1]))
         self._weights_of_views = to_device(context, self._view_weight)
@@ -113,9 +123,8 @@ class Coverage:
 
     def _coarse_matrices(self, geometry: ConeBeamGeometry) -> np.ndarray:
         """Projection matrices from the middles of coarse voxels."""
-        sizes = np.array([_ACROSS, _ACROSS, _ALONG], np.float64)
-        to_fine = np.diag([*sizes, 1.0])
-        to_fine[:3, 3] = (sizes - 1) / 2
+        to_fine = np.diag([*self._blocks, 1.0])
+        to_fine[:3, 3] = (self._blocks - 1) / 2
         matrices = geometry.projection_matrices() @ self._grid.index_to_world() @ to_fine
         return np.asarray(matrices.reshape(-1, 12))
 
@@ -145,6 +154,7 @@ class Coverage:
             self._weights_of_views,
             self._weights,
             *self._coarse,
+            *self._last_middles,
             *self._panel,
             self._counted[0],
             wait_for=[*(wait_for or ()), *self._last],
@@ -212,8 +222,9 @@ class Coverage:
             planes,
             first,
             *self._coarse,
+            *self._last_middles,
             1.0 / _ACROSS,
-            1.0 / _ALONG,
+            1.0 / float(self._blocks[2]),
             float(-x[0] / size),
             float(-y[0] / size),
             self._radius,

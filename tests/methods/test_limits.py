@@ -90,28 +90,28 @@ def _grains(geometry, spacing):
     )
 
 
-def _moved(spacing):
+def _moved(spacing, shift):
     geometry = paper_like("circular", 60, (64, 64))
-    truth = simulated_motion("random", geometry, shift=(-2.5, 2.0), seed=1)
+    truth = simulated_motion("random", geometry, shift=shift, seed=1)
     images = _grains(geometry, spacing).line_integrals(geometry.with_motion(truth))
     return clra.Scan(images, geometry, truth=truth)
 
 
 def test_grains_that_a_quarter_loses_are_said_and_half_finds_them():
-    scan = _moved(4.0)
+    scan = _moved(4.0, (-6.25, 5.0))
     with pytest.warns(
         UserWarning, match=r"^HR moved \d\d of 60 views by 1 pixel or more, .* at QR"
     ):
         result = clra.align(scan, estimate="shift")
     at_quarter = [step.mae_v for step in result.history if step.level == "QR"]
-    assert min(at_quarter) > 0.9  # of 1.1 pixel on average, with a correlation of 0.87
+    assert min(at_quarter) > 0.5  # of 2.8 pixels on average, with a correlation of 0.98
     assert np.abs(result.motion.shift_v - scan.truth.shift_v).mean() < 0.3
-    assert np.abs(result.motion.shift_u - scan.truth.shift_u).mean() < 0.1
+    assert np.abs(result.motion.shift_u - scan.truth.shift_u).mean() < 0.3
 
 
 @pytest.mark.parametrize("photons", [None, 100])
 def test_grains_that_a_quarter_keeps_are_not_mentioned(photons):
-    scan = _moved(12.0)
+    scan = _moved(12.0, (-2.5, 2.0))
     images = scan.read(0, scan.views)
     if photons is not None:
         images = np.stack([counted(image, photons, seed=k) for k, image in enumerate(images)])

@@ -55,6 +55,26 @@ def test_views_are_counted(context, queue, order):
     assert error.max() < TOLERANCE * expected.max()
 
 
+@pytest.mark.parametrize(
+    ("rows", "planes"), [(1, 1), (2, 1), (3, 2), (3, 3), (5, 5), (9, 9), (38, 1), (38, 2), (38, 5)]
+)
+def test_all_views_count_where_grid_or_panel_is_thin(context, queue, rows, planes):
+    geometry = clra.circular(60, **(PANEL | {"shape": (rows, 45)}))
+    grid = VolumeGrid(shape=(planes, 17, 9), voxel_size=0.6)
+    middle = _normalised(context, queue, geometry, grid, np.ones(rows))[planes // 2]
+    assert np.allclose(1 / middle, 60, rtol=1e-5)
+
+
+def test_a_plane_at_the_end_of_the_field_of_view_is_counted(context, queue):
+    geometry = clra.circular(60, **PANEL)
+    grid = VolumeGrid(shape=(1, 18, 21), voxel_size=0.6, centre=(0.4, -0.3, 9.1))
+    weight = _smooth_weight(geometry.rows)
+    expected = _counted(geometry, grid, weight)
+    assert 0.1 * weight.max() * 60 < expected.min()
+    found = 1 / _normalised(context, queue, geometry, grid, weight)
+    assert np.abs(found - expected).max() < TOLERANCE * 60 * weight.max()
+
+
 def test_views_count_by_their_weight(context, queue):
     geometry = clra.helix(50, angle_step=math.radians(23), z_step=0.3, **PANEL)
     grid = VolumeGrid(shape=(19, 10, 11), voxel_size=1.1)
