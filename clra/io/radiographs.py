@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.io.errors import InputError
+from clra.model.patches import Patches
 
 Floats = NDArray[np.float32]
 Frames = NDArray[np.intp]
@@ -134,7 +135,7 @@ class Radiographs:
             )  # fmt: skip
         for flat in self._flats:
             flat[dead] = 1.0
-        self._patches = _Patches(dead)
+        self._patches = Patches(dead)
         if dead.any():
             self._note(f"{int(dead.sum())} dead pixels (flat not above dark) filled from beside")
         if self._patches.far.any():
@@ -202,38 +203,6 @@ class Radiographs:
         if full[worst] and not self._warned:
             self._warned = True
             warnings.warn(f"{self._path}: {self._field}: {found}: saturated", stacklevel=4)
-
-
-class _Patches:
-    """Where dead pixels are, and the good pixels that stand in for each."""
-
-    def __init__(self, dead: NDArray[np.bool_]) -> None:
-        self._sets: list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]] = []
-        self.far = dead.copy()
-        rows, columns = dead.shape
-        for reach in (1, 2):
-            j, i = np.nonzero(self.far)
-            offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
-            near_j, near_i = j[:, None] + offsets[0], i[:, None] + offsets[1]
-            inside = (near_j >= 0) & (near_j < rows) & (near_i >= 0) & (near_i < columns)
-            near = np.where(inside, near_j * columns + near_i, 0)
-            good = inside & ~dead.ravel()[near]
-            found = good.any(axis=1)
-            self._sets.append(((j * columns + i)[found], near[found], good[found]))
-            self.far[j[found], i[found]] = False
-        if self.far.any():
-            from scipy.ndimage import distance_transform_edt
-
-            nearest = distance_transform_edt(dead, return_distances=False, return_indices=True)
-            near = (nearest[0] * columns + nearest[1])[self.far][:, None]
-            self._sets.append((np.flatnonzero(self.far), near, np.ones_like(near, dtype=np.bool_)))
-
-    def fill(self, image: Floats) -> None:
-        """Replace the dead pixels of one radiograph, in place."""
-        flat = image.reshape(-1)
-        for pixels, near, good in self._sets:
-            if len(pixels):
-                flat[pixels] = np.nanmedian(np.where(good, flat[near], np.nan), axis=1)
 
 
 def _runs(frames: Frames) -> list[tuple[int, int]]:

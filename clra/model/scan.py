@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clra.model.checks import selection
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
+from clra.model.patches import Patches
 
 KINDS = ("line-integrals", "transmission")
 
@@ -50,7 +52,8 @@ class Scan:
     truth : Motion, optional
         The motion that a simulation put in.
     mask : array_like of bool, (rows, columns), optional
-        True where the panel's pixels may be used.
+        True where the panel's pixels may be used. What the others hold is never used, be it NaN:
+        they are filled from beside.
 
     Raises
     ------
@@ -133,12 +136,20 @@ class Scan:
         pixels = np.ascontiguousarray(self.projections[start:stop], dtype=np.float32)
         if self.kind == "transmission":
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
+        if self._patches is not None:
+            pixels = pixels.copy()
+            for image in pixels:
+                self._patches.fill(image)
         # One such pixel would spread over the whole volume through filter and back-projection.
         finite = np.isfinite(pixels).all(axis=(1, 2))
         if not finite.all():
             view = start + int(np.argmin(finite))
             raise ValueError(f"{self.name}: view {view}: found a pixel that is no finite number")
         return pixels
+
+    @cached_property
+    def _patches(self) -> Patches | None:
+        return None if self.mask is None or self.mask.all() else Patches(~self.mask)
 
     @property
     def window(self) -> tuple[slice, slice]:

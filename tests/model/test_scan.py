@@ -88,6 +88,21 @@ def test_subsets_are_read_in_runs_and_only_when_asked(geometry, lines):
     np.testing.assert_array_equal(twice.read(0, 3), lines[[6, 1, 5]])
 
 
+@pytest.mark.parametrize("kind", ["line-integrals", "transmission"])
+def test_pixels_that_may_not_be_used_are_filled_from_beside(geometry, kind):
+    plane = np.add.outer(np.arange(SHAPE[0]), 10 * np.arange(SHAPE[1])) / 99
+    pixels = np.tile(plane if kind == "line-integrals" else np.exp(-plane), (VIEWS, 1, 1))
+    mask = np.ones(SHAPE, bool)
+    mask[1, 3] = mask[:, 0] = False
+    pixels[:4, ~mask], pixels[4:, ~mask] = np.nan, 7.0
+    before = pixels.copy()
+    found = Scan(pixels, geometry, kind, mask=mask).read(2, 6)
+    np.testing.assert_allclose(found[:, mask], np.tile(plane[mask], (4, 1)), atol=ROUNDING)
+    np.testing.assert_allclose(found[:, 1, 3], plane[1, 3], atol=ROUNDING)
+    np.testing.assert_allclose(found[:, 1, 0], plane[1, 1], atol=ROUNDING)
+    np.testing.assert_array_equal(pixels, before)
+
+
 def test_mask_is_a_copy_of_booleans(geometry, lines):
     mask = np.ones(SHAPE, np.uint8)
     scan = Scan(lines, geometry, mask=mask)
