@@ -164,4 +164,5 @@ def from_neighbours(motion: Motion, weak: NDArray[np.bool_]) -> Motion:
         shift_u=filled(motion.shift_u),
         shift_v=filled(motion.shift_v),
         magnification=filled(motion.magnification),
+        cause=motion.cause,
     )

@@ -329,5 +329,10 @@ def without_gauge(
     shifts -= design @ _least_squares(design, shifts, _COMMON)
     u, v = shifts.reshape(2, motion.views)
     factor = 1.0 if span is None else span / max(np.ptp(u), np.ptp(v))
-    freed = Motion(shift_u=factor * u, shift_v=factor * v, magnification=motion.magnification)
+    freed = Motion(
+        shift_u=factor * u,
+        shift_v=factor * v,
+        magnification=motion.magnification,
+        cause=motion.cause,
+    )
     return freed.normalised() if magnification else freed

@@ -97,10 +97,12 @@ def test_weak_views_get_what_lies_between_their_neighbours():
         shift_u=np.where(views == 3, 99, views),
         shift_v=np.where(views == 3, 99, -2 * views),
         magnification=np.where(views == 3, 1.5, 1 + 0.001 * views),
+        cause="source",
     )
     mended = from_neighbours(spoilt, views == 3)
     for name in ("shift_u", "shift_v", "magnification"):
         assert np.allclose(getattr(mended, name), getattr(motion, name), rtol=1e-12)
+    assert mended.cause == "source"
     assert from_neighbours(spoilt, views < 0) is spoilt
 
 

@@ -218,6 +218,7 @@ def test_without_gauge_leaves_a_truth_that_errors_cannot_hide_in(scan, magnifica
         np.abs(Gauge(scan, sample_points(grid), magnification=magnification).fit(motion).part)
         for motion in (moved, truth)
     )
+    assert without_gauge(moved.caused_by("source"), scan, clouds).cause == "source"
     assert before[:, :2].max() > 3
     # Clouds of other samples would look a little different.
     assert after[:, :2].max() < 0.15
