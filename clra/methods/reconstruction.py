@@ -139,11 +139,14 @@ def reconstruct_into(
         raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
-    if believed is not None and (believed.shape != (scan.views,) or not believed.any()):
-        raise ValueError(
-            f"believed: found {believed.shape} with {believed.sum()} views, expected "
-            f"({scan.views},) with at least one"
-        )
+    if believed is not None:
+        believed = np.asarray(believed)
+        # Numbers would choose views 0 and 1.
+        if believed.dtype != np.bool_ or believed.shape != (scan.views,) or not believed.any():
+            raise ValueError(
+                f"believed: found {believed.shape} of {believed.dtype}, {believed.sum()} in all, "
+                f"expected ({scan.views},) of bool with at least one view"
+            )
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
     motion = None if motion is None else motion.about(*scan.window_aside)
     scan = scan.cropped()

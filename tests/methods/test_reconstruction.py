@@ -1,4 +1,4 @@
-"""Views that a reconstruction is told to leave out."""
+"""Views and pixels that a reconstruction is told to leave out."""
 
 import math
 
@@ -43,6 +43,24 @@ def test_what_is_not_believed_does_not_matter(scan, method):
     assert np.abs(believing - volumes[0]).max() > 0.05
 
 
+@pytest.mark.parametrize("method", ["fbp", "katsevich", "osem-tr", "imgr"])
+def test_what_masked_pixels_hold_does_not_matter(scan, method):
+    mask = np.ones(scan.geometry.shape, np.bool_)
+    mask[30:32, 40:42] = mask[33, 20] = False
+    grid = default_grid(scan.geometry)
+    truth = BODY.volume(grid)
+    motion = clra.Motion(shift_u=np.full(121, 0.4), shift_v=np.zeros(121))
+    moved = BODY.line_integrals(scan.geometry.with_motion(motion))
+
+    def error(pixels, **more):
+        volume = clra.reconstruct(clra.Scan(pixels, scan.geometry, **more), method, motion=motion)
+        return np.sqrt(np.mean((volume - truth)[10:-10] ** 2))
+
+    spoilt = np.where(mask, moved, 9.0)
+    assert error(spoilt, mask=mask) < 1.02 * error(moved)
+    assert error(spoilt) > 1.2 * error(moved)
+
+
 def test_aligning_on_the_way_finds_them_out(scan):
     good, bad = (clra.reconstruct(s, align=True) for s in (scan, _spoilt(scan, 9.0)))
     assert np.sqrt(np.mean((bad - good) ** 2)) < 0.05
@@ -68,7 +86,9 @@ def test_katsevich_puts_what_lies_between_in_place_of_them(scan, value):
     assert rms(again) == pytest.approx(rms(found), rel=0.01)
 
 
-@pytest.mark.parametrize("believed", [np.ones(7, np.bool_), np.zeros(121, np.bool_)])
+@pytest.mark.parametrize(
+    "believed", [np.ones(7, np.bool_), np.zeros(121, np.bool_), np.ones(121, np.intp)]
+)
 def test_choices_that_are_none(scan, believed):
     with pytest.raises(ValueError, match="believed: found"):
         clra.reconstruct(scan, believed=believed)
