@@ -1,6 +1,7 @@
 """The commands that look at machines and scans, and make scans."""
 
 import warnings
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -82,7 +83,9 @@ def import_scan(
     angles: Annotated[
         str,
         typer.Option(
-            metavar="FILE", help="Text file with an angle [degree] a line, or START:STOP:COUNT."
+            metavar="FILE",
+            help="Text file with an angle [degree] a line, or START:STOP:COUNT with both ends "
+            "included.",
         ),
     ],
     pixel_size: Annotated[
@@ -97,12 +100,32 @@ def import_scan(
     parallel: Annotated[bool, typer.Option("--parallel", help="The beam is parallel.")] = False,
     flat: Annotated[
         list[str] | None,
-        typer.Option(metavar="FILE", help="Frames of the open beam; may be given again."),
+        typer.Option(
+            metavar="FILE",
+            help="Frames of the open beam, or a pattern in quotes; may be given again.",
+        ),
+    ] = None,
+    flat_after: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE",
+            help="The same, taken after the radiographs: flats drift linearly from first to last.",
+        ),
     ] = None,
     dark: Annotated[
         list[str] | None,
-        typer.Option(metavar="FILE", help="Frames without beam; may be given again."),
+        typer.Option(
+            metavar="FILE", help="Frames without beam, or a pattern in quotes; may be given again."
+        ),
     ] = None,
+    kind: Annotated[
+        str,
+        typer.Option(
+            metavar="counts|transmission|line-integrals",
+            help="What frames hold; transmission (I/I0) and line integrals (-log of it) have no "
+            "flats and darks.",
+        ),
+    ] = "counts",
     shape: Annotated[
         str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Of headerless frames.")
     ] = None,
@@ -144,7 +167,7 @@ def import_scan(
     from clra.io.frames import import_frames
 
     with console.progress() as report:
-        import_frames(
+        made = import_frames(
             out,
             frames,
             angles,
@@ -153,7 +176,9 @@ def import_scan(
             pixel_size=pixel(pixel_size),
             parallel=parallel,
             flats=flat or (),
+            flats_after=flat_after or (),
             darks=dark or (),
+            kind=kind,
             shape=panel("--shape", shape) if shape else None,
             dtype=dtype,
             byteorder=byteorder,
@@ -164,7 +189,19 @@ def import_scan(
             name=out.stem,
             progress=report,
         )
-    console.summary({"file": out}, f"wrote {out}")
+    rows, columns = made.shape
+    first, last = made.angles_deg
+    console.summary(
+        {"file": out, **asdict(made)},
+        f"wrote {out}: {made.views} radiographs of {rows} x {columns}, {made.flats} flats, "
+        f"{made.darks} darks; the sample turns from {first:g} to {last:g} degrees",
+    )
+    if kind == "counts" and not made.flats:
+        warnings.warn(
+            f"{out} has no flats: every command that reads it needs --white COUNTS, and 1 if these "
+            "radiographs are transmission already",
+            stacklevel=1,
+        )
 
 
 def simulate(

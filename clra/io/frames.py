@@ -3,18 +3,45 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from clra.io.atomic import ensure_writable
 from clra.io.errors import InputError
+from clra.io.nxclra import KINDS
 from clra.io.nxgeometry import Fields, far_source_distance
 from clra.io.nxtomo_writing import write_nxtomo
 from clra.io.reporting import Report
-from clra.io.stacks import FrameStack, RawLayout, Source, read_numbers
+from clra.io.stacks import FrameStack, RawLayout, Source, read_numbers, warn_of_gaps
+
+# Angles that all lie within this [degree] are warned of: a whole turn is 6.28 rad.
+_NARROW = 7.0
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was written.
+
+    Attributes
+    ----------
+    views, flats, darks : int
+        Frames of each role.
+    shape : (int, int)
+        Their rows and columns.
+    angles_deg : (float, float)
+        Turn of the sample at the first and at the last radiograph.
+    """
+
+    views: int
+    flats: int
+    darks: int
+    shape: tuple[int, int]
+    angles_deg: tuple[float, float]
 
 
 def import_frames(
@@ -27,7 +54,9 @@ def import_frames(
     pixel_size: float | tuple[float, float],
     parallel: bool = False,
     flats: Source | Sequence[Source] = (),
+    flats_after: Source | Sequence[Source] = (),
     darks: Source | Sequence[Source] = (),
+    kind: str = "counts",
     shape: tuple[int, int] | None = None,
     dtype: str = "uint16",
     byteorder: str = "little",
@@ -37,7 +66,7 @@ def import_frames(
     rotation: str = "ccw",
     name: str | None = None,
     progress: Report | None = None,
-) -> None:
+) -> Imported:
     """Write raw frames as an NXtomo scan, frame by frame; it appears whole or not at all.
 
     Row 0 of a frame is its top; columns count to the right as seen from the source.
@@ -62,8 +91,13 @@ def import_frames(
     parallel : bool
         The beam is parallel: a source so far away that rays end within 1/8000 of the panel's width
         of where parallel ones would, and the detector at the axis, so that a voxel is a pixel.
-    flats, darks : path-like or list of path-like, optional
-        Frames of the open beam, and without beam.
+    flats, flats_after : path-like or list of path-like, optional
+        Frames of the open beam, taken before and after the radiographs: with both, each radiograph
+        is divided by what lies between, for its place.
+    darks : path-like or list of path-like, optional
+        Frames without beam.
+    kind : {"counts", "transmission", "line-integrals"}
+        What the frames hold; only counts take flats and darks.
     shape : (int, int), optional
         Rows and columns of headerless frames.
     dtype : str
@@ -84,6 +118,10 @@ def import_frames(
     progress : callable, optional
         Called with a ``Progress`` as frames are written.
 
+    Returns
+    -------
+    Imported
+
     Raises
     ------
     InputError
@@ -92,14 +130,18 @@ def import_frames(
         If `out` cannot be written.
     """
     layout = RawLayout(shape=shape, dtype=dtype, byteorder=byteorder, header=header)
+    if kind not in KINDS:
+        raise InputError.at("--kind", "kind", repr(kind), f"one of {', '.join(KINDS)}")
+    if kind != "counts" and any(map(_any, (flats, flats_after, darks))):
+        raise InputError.at("--kind", "kind", f"{kind!r} and flats or darks", "neither of them")
     with ExitStack() as files:
-        stack, bright, dark = (
+        stack, bright, after, dark = (
             files.enter_context(closing(FrameStack(given, layout))) if _any(given) else None
-            for given in (frames, flats, darks)
+            for given in (frames, flats, flats_after, darks)
         )
         if stack is None:
             raise InputError("frames: found no file, expected at least one")
-        stacks = [part for part in (stack, bright, dark) if part is not None]
+        stacks = [part for part in (stack, bright, after, dark) if part is not None]
         tables = [
             given for given in (angles, z_translation) if isinstance(given, str | os.PathLike)
         ]
@@ -109,10 +151,23 @@ def import_frames(
                 found = f"{part.shape[1:]} pixels"
                 raise InputError.at(part.files[0], "frame", found, f"{stack.shape[1:]}")
         views, panel = stack.shape[0], stack.shape[1:]
+        if kind != "counts" and stack.dtype.kind != "f":
+            raise InputError.at(
+                stack.files[0], "pixels", stack.dtype, f"floating point, as {kind} have it"
+            )
+        warn_of_gaps(stack.files)
+        told = "of" if len(stack.files) == 1 else f"from {stack.files[0].name} to"
+        told += f" {stack.files[-1].name}"
         row_step, column_step = _pixel(pixel_size)
         if rotation not in ("ccw", "cw"):
             raise InputError.at("--rotation", "rotation", repr(rotation), "ccw or cw")
-        turn = np.deg2rad(read_numbers(angles, "angles", views))
+        degrees = read_numbers(angles, "angles", views, told)
+        if views > 2 and np.ptp(degrees) < _NARROW:
+            warnings.warn(
+                f"angles go from {degrees.min():g} to {degrees.max():g}, and are taken as degrees",
+                stacklevel=2,
+            )
+        turn = np.deg2rad(degrees)
         propagation = None
         if parallel or (source_distance is not None and np.isinf(source_distance)):
             near, behind = far_source_distance(panel, column_step), 0.0
@@ -124,7 +179,7 @@ def import_frames(
         # Moving the axis rather than the panel keeps to what NXtomo can say.
         translation[:, 0] = centre_offset * column_step * near / (near + behind)
         if z_translation is not None:
-            translation[:, 2] = read_numbers(z_translation, "z_translation", views)
+            translation[:, 2] = read_numbers(z_translation, "z_translation", views, told)
         fields = Fields(
             angle=turn if rotation == "ccw" else -turn,
             translation=translation,
@@ -137,12 +192,21 @@ def import_frames(
             stack,
             fields.geometry(panel),
             flats=bright,
+            flats_after=after,
             darks=dark,
+            kind=kind,
             dtype=np.result_type(*(part.dtype for part in stacks)),
             name=name or os.path.basename(os.fspath(out)),
             fields=fields,
             propagation_distance=propagation,
             progress=progress,
+        )
+        return Imported(
+            views=views,
+            flats=sum(part.shape[0] for part in (bright, after) if part is not None),
+            darks=0 if dark is None else dark.shape[0],
+            shape=panel,
+            angles_deg=(float(degrees[0]), float(degrees[-1])),
         )
 
 

@@ -40,7 +40,10 @@ def scan_entry(file: h5py.File, name: str | None) -> h5py.Group:
     if len(entries) > 1:
         listed = ", ".join(entries)
         raise InputError.at(
-            file.filename, "/", f"{len(entries)} scans: {listed}", "one: say which with entry="
+            file.filename,
+            "/",
+            f"{len(entries)} scans: {listed}",
+            "one: say which with entry= / --entry",
         )
     return next(iter(entries.values()))
 

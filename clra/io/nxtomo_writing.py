@@ -19,6 +19,8 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Projections
 
+Views = NDArray[np.intp]
+
 # Frames are copied in pieces of about this many bytes: small enough for any machine's memory, large
 # enough that the disk is the limit.
 _PIECE = 8 << 20
@@ -33,6 +35,7 @@ def write_nxtomo(
     geometry: ConeBeamGeometry,
     *,
     flats: Projections | None = None,
+    flats_after: Projections | None = None,
     darks: Projections | None = None,
     kind: str = "counts",
     dtype: Any = None,
@@ -57,8 +60,8 @@ def write_nxtomo(
         Sliced along the first axis, some at a time.
     geometry : ConeBeamGeometry
         Of the radiographs.
-    flats, darks : array or array-like object, (n, rows, columns), optional
-        Written before the radiographs, darks first.
+    flats, flats_after, darks : array or array-like object, (n, rows, columns), optional
+        Darks and flats are written before the radiographs, `flats_after` behind them.
     kind : {"counts", "transmission", "line-integrals"}
         What the radiographs hold.
     dtype : dtype-like, optional
@@ -91,8 +94,8 @@ def write_nxtomo(
     expected = (geometry.views, *geometry.shape)
     if tuple(radiographs.shape) != expected:
         raise ValueError(f"radiographs: found shape {radiographs.shape}, expected {expected}")
-    parts: list[tuple[int, Projections]] = [(PROJECTION, radiographs)]
-    parts = [(r, p) for r, p in ((DARK, darks), (FLAT, flats)) if p is not None] + parts
+    ordered = ((DARK, darks), (FLAT, flats), (PROJECTION, radiographs), (FLAT, flats_after))
+    parts = [(role, part) for role, part in ordered if part is not None]
     for _, part in parts:
         if tuple(part.shape[1:]) != geometry.shape:
             raise ValueError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
@@ -123,9 +126,9 @@ def write_nxtomo(
         with h5py.File(temporary, "w") as file:
             entry = _group(file, "entry", "NXentry")
             file.attrs["default"] = "entry"
-            data, offset = _detector(entry, fields, roles, shape, pixels)
+            data, offset = _detector(entry, fields, roles, views, shape, pixels)
             data.attrs[KIND_ATTRIBUTE] = kind
-            _sample(entry, fields, len(roles), name, propagation_distance)
+            _sample(entry, fields, len(roles), views, name, propagation_distance)
             _links(entry, name)
             write_additions(
                 entry,
@@ -159,6 +162,7 @@ def _detector(
     entry: h5py.Group,
     fields: Fields,
     roles: NDArray[np.int32],
+    views: Views,
     shape: tuple[int, ...],
     pixels: np.dtype[Any],
 ) -> tuple[h5py.Dataset, int]:
@@ -166,13 +170,13 @@ def _detector(
     instrument = _group(entry, "instrument", "NXinstrument")
     source = _group(instrument, "source", "NXsource")
     source["probe"] = "x-ray"
-    _put(source, "distance", -_one_or_each(fields.source_distance, len(roles)), "mm")
+    _put(source, "distance", -_one_or_each(fields.source_distance, views, len(roles)), "mm")
     detector = _group(instrument, "detector", "NXdetector")
     detector["image_key"] = roles
     detector["image_key_control"] = roles
     _put(detector, "x_pixel_size", fields.pixel[0], "mm")
     _put(detector, "y_pixel_size", fields.pixel[1], "mm")
-    _put(detector, "distance", _one_or_each(fields.detector_distance, len(roles)), "mm")
+    _put(detector, "distance", _one_or_each(fields.detector_distance, views, len(roles)), "mm")
     data, offset = reserve(detector, "data", shape, pixels)
     data.attrs["interpretation"] = "image"
     return data, offset
@@ -182,15 +186,16 @@ def _sample(
     entry: h5py.Group,
     fields: Fields,
     count: int,
+    views: Views,
     name: str,
     propagation_distance: float | None,
 ) -> None:
     """Write the sample: its name, angles and translations."""
     sample = _group(entry, "sample", "NXsample")
     sample["name"] = name
-    _put(sample, "rotation_angle", _spread(np.rad2deg(fields.angle), count), "degree")
+    _put(sample, "rotation_angle", _spread(np.rad2deg(fields.angle), views, count), "degree")
     for axis, values in zip("xyz", fields.translation.T, strict=True):
-        _put(sample, f"{axis}_translation", _spread(values, count), "mm")
+        _put(sample, f"{axis}_translation", _spread(values, views, count), "mm")
     if propagation_distance is not None:
         _put(sample, "propagation_distance", propagation_distance, "mm")
 
@@ -224,11 +229,12 @@ def _put(group: h5py.Group, name: str, value: Any, unit: str) -> None:
     group[name].attrs["units"] = unit
 
 
-def _spread(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Values of the radiographs at the last frames; flats and darks get those of the first."""
-    return np.concatenate([np.full(count - len(values), values[0]), values])
+def _spread(values: NDArray[np.float64], views: Views, count: int) -> NDArray[np.float64]:
+    """Values of the radiographs, at their frames; flats and darks get those of the nearest."""
+    nearest = np.clip(np.arange(count) - views[0], 0, len(values) - 1)
+    return np.asarray(values[nearest], np.float64)
 
 
-def _one_or_each(values: NDArray[np.float64], count: int) -> Any:
+def _one_or_each(values: NDArray[np.float64], views: Views, count: int) -> Any:
     """Return the one value where all are equal, as NXtomo has it."""
-    return values[0] if np.all(values == values[0]) else _spread(values, count)
+    return values[0] if np.all(values == values[0]) else _spread(values, views, count)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import glob
 import os
 import re
+import warnings
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,8 +135,8 @@ class FrameStack:
 
     def _open(self, path: Path) -> _File:
         if not path.is_file():
-            found = "a folder: give its files" if path.is_dir() else "no such file"
-            raise InputError(f"{path}: {found}")
+            found = f"a folder: give its files, such as '{path}/*.tif'"
+            raise InputError(f"{path}: {found if path.is_dir() else 'no such file'}")
         if path.suffix.lower() in _TIFF:
             return _tiff(path)
         return _raw(path, self._layout)
@@ -194,7 +196,7 @@ def _raw(path: Path, layout: RawLayout) -> _File:
     if layout.shape is None:
         raise InputError.at(
             path, "format", f"suffix {path.suffix!r}",
-            "a TIFF, or the rows, columns and type of raw frames (shape=, dtype=)",
+            "a TIFF, or rows, columns and type of raw frames (shape=, dtype= / --shape, --dtype)",
         )  # fmt: skip
     pixel = layout.pixel()
     rows, columns = layout.shape
@@ -226,13 +228,41 @@ def _matching(files: Source | Sequence[Source]) -> tuple[Path, ...]:
     return tuple(found)
 
 
+def warn_of_gaps(files: Sequence[Path]) -> None:
+    """Warn where the numbers in the names of files do not go on as they do elsewhere.
+
+    A frame that was lost shifts all that follow against their angles, and so does an order in which
+    10 comes before 2.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        In the order of the frames.
+    """
+    names = [re.split(r"(\d+)", path.name) for path in files]
+    counted = [k for k, parts in enumerate(zip(*names, strict=False)) if len(set(parts)) > 1]
+    if len(counted) != 1 or counted[0] % 2 == 0 or len({len(parts) for parts in names}) != 1:
+        return  # not told apart by one number
+    steps = np.diff([int(parts[counted[0]]) for parts in names]).tolist()
+    usual = Counter(steps).most_common(1)[0][0]
+    gaps = [k for k, step in enumerate(steps) if step != usual]
+    if gaps:
+        k = gaps[0]
+        warnings.warn(
+            f"{files[k].name} is followed by {files[k + 1].name}"
+            f"{f', and {len(gaps) - 1} more such' if gaps[1:] else ''}: are frames missing or out "
+            "of order? Angles go with frames as they come; a pattern in quotes sorts by number",
+            stacklevel=3,
+        )
+
+
 def _natural(name: str) -> list[tuple[int, str]]:
     """Sorting key by which 9 comes before 10."""
     parts = re.split(r"(\d+)", name)
     return [(int(p), "") if p.isdigit() else (0, p) for p in parts]
 
 
-def read_numbers(source: Source | ArrayLike, what: str, count: int) -> Floats:
+def read_numbers(source: Source | ArrayLike, what: str, count: int, frames: str) -> Floats:
     """Read one number for each frame.
 
     Parameters
@@ -244,6 +274,8 @@ def read_numbers(source: Source | ArrayLike, what: str, count: int) -> Floats:
         Their name in messages.
     count : int
         How many there must be.
+    frames : str
+        Which frames they are for, in messages.
 
     Returns
     -------
@@ -265,7 +297,7 @@ def read_numbers(source: Source | ArrayLike, what: str, count: int) -> Floats:
         name = os.fspath(source)
         values = _read_column(Path(name), what)
     if values.ndim != 1 or len(values) != count:
-        raise InputError.at(name, what, f"{values.size} numbers", f"{count}, one a frame")
+        raise InputError.at(name, what, f"{values.size} numbers", f"{count}, one a frame {frames}")
     if not np.isfinite(values).all():
         frame = int(np.argmin(np.isfinite(values)))
         raise InputError.at(name, what, f"{values[frame]} at frame {frame}", "finite numbers")
@@ -291,4 +323,6 @@ def _number(field: str, where: str, what: str) -> float:
     try:
         return float(field)
     except ValueError:
-        raise InputError.at(where, what, repr(field), "one number") from None
+        told = repr(field if len(field) < 40 else f"{field[:36]} ...")
+        expected = "one number (a line; what follows # is left out)"
+        raise InputError.at(where, what, told, expected) from None

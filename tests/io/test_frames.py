@@ -1,8 +1,11 @@
 """Raw frames into an NXtomo file and out again."""
 
+import re
+import warnings
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -10,6 +13,7 @@ import tifffile
 from clra.io.errors import InputError
 from clra.io.frames import import_frames
 from clra.io.scans import read_scan
+from clra.io.stacks import warn_of_gaps
 
 VIEWS, ROWS, COLUMNS = 11, 5, 7
 SCANNER = {"source_distance": 30.0, "detector_distance": 270.0, "pixel_size": 0.5}
@@ -58,7 +62,7 @@ def test_tiff(kind: str, tmp_path: Path, counts: np.ndarray, fields: dict[str, A
         if kind == "pattern":  # 10 sorts after 9
             frames = str(tmp_path / "scan_*.tif")
     out = tmp_path / "scan.nxs"
-    import_frames(out, frames, np.arange(VIEWS), **SCANNER, **fields)
+    import_frames(out, frames, "0:300:11", **SCANNER, **fields)
     check(out, counts)
 
 
@@ -127,10 +131,72 @@ def test_flats_of_another_type_are_kept_exact(tmp_path: Path, counts: np.ndarray
     tifffile.imwrite(tmp_path / "stack.tif", counts)
     tifffile.imwrite(tmp_path / "flat.tif", np.full((ROWS, COLUMNS), 1000.5, np.float32))
     out = tmp_path / "scan.nxs"
-    import_frames(
-        out, tmp_path / "stack.tif", np.arange(VIEWS), **SCANNER, flats=tmp_path / "flat.tif"
-    )
+    import_frames(out, tmp_path / "stack.tif", "0:300:11", **SCANNER, flats=tmp_path / "flat.tif")
     np.testing.assert_allclose(read_scan(out).projections[:], counts / 1000.5, rtol=1e-6)
+
+
+def test_flats_before_and_after(tmp_path: Path, counts: np.ndarray, fields: dict[str, Any]) -> None:
+    """The open beam fades from 1000 counts to 600: each radiograph has its own."""
+    tifffile.imwrite(tmp_path / "stack.tif", counts)
+    after = np.full((3, ROWS, COLUMNS), 600, np.uint16)
+    tifffile.imwrite(tmp_path / "after.tif", after, photometric="minisblack")
+    out, heights = tmp_path / "scan.nxs", np.linspace(-1, 2, VIEWS)
+    made = import_frames(
+        out, tmp_path / "stack.tif", "0:300:11", **SCANNER, **fields,
+        flats_after=tmp_path / "after.tif", z_translation=heights,
+    )  # fmt: skip
+    assert (made.views, made.flats, made.darks, made.shape) == (VIEWS, 4, 1, (ROWS, COLUMNS))
+    assert made.angles_deg == (0.0, 300.0)
+    # Frames: a dark, a flat, eleven radiographs, three flats whose middle is frame 14.
+    part = np.arange(1, VIEWS + 1) / 13
+    beam = (1000 + part * (600 - 1000) - 10)[:, None, None]
+    scan = read_scan(out)
+    np.testing.assert_allclose(scan.projections[:], (counts - 10.0) / beam, rtol=1e-6)
+    np.testing.assert_allclose(scan.geometry.source[:, 2], -heights, atol=1e-12)
+    with h5py.File(out) as file:  # the plain fields, which other programs read
+        angles = file["entry/sample/rotation_angle"][()]
+        np.testing.assert_allclose(angles, [0, 0, *np.arange(0, 301, 30), 300, 300, 300])
+
+
+@pytest.mark.parametrize("kind", ["transmission", "line-integrals"])
+def test_frames_that_are_no_counts(kind: str, tmp_path: Path, counts: np.ndarray) -> None:
+    values = (counts / 1000).astype(np.float32)
+    tifffile.imwrite(tmp_path / "stack.tif", values)
+    import_frames(tmp_path / "scan.nxs", tmp_path / "stack.tif", "0:300:11", **SCANNER, kind=kind)
+    expected = values if kind == "line-integrals" else -np.log(values)
+    np.testing.assert_allclose(
+        read_scan(tmp_path / "scan.nxs").read(0, VIEWS), expected, rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        ([f"scan2_{i:03}.tif" for i in (0, 5, 10, 20, 25)], "010.tif is followed by .*020.tif:"),
+        ([f"{i}.tif" for i in (1, 10, 11, 2, 3, 4)], r" 10.tif, and 1 more such:|11.tif .* 2.tif"),
+        ([f"a{i}b{i}.tif" for i in (1, 2, 4)], None),
+        ([f"2_{i:03}.tif" for i in range(0, 25, 5)], None),
+        ([f"{i}.tif" for i in "abd"], None),
+    ],
+)
+def test_frames_that_are_missing_or_out_of_order_are_noticed(
+    names: list[str], told: str | None, recwarn: pytest.WarningsRecorder
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warn_of_gaps([Path("folder7") / name for name in names])
+    assert len(recwarn) == (told is not None)
+    assert told is None or re.search(told, str(recwarn[0].message))
+
+
+def test_angles_in_radians_are_noticed(
+    tmp_path: Path, counts: np.ndarray, fields: dict[str, Any]
+) -> None:
+    tifffile.imwrite(tmp_path / "stack.tif", counts)
+    with pytest.warns(UserWarning, match=r"angles go from 0 to 6\.2, and are taken as degrees"):
+        import_frames(
+            tmp_path / "scan.nxs", tmp_path / "stack.tif", "0:6.2:11", **SCANNER, **fields
+        )
 
 
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
@@ -146,8 +212,15 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "no file": ({"frames": "none.tif"}, "none.tif: no such file"),
     "no match": ({"frames": "none*.tif"}, r"none\*\.tif: no file matches"),
     "nothing": ({"frames": []}, "found no file, expected at least one"),
-    "folder": ({"frames": "."}, "a folder: give its files"),
-    "raw": ({"frames": "frames.raw"}, r"suffix '\.raw', expected a TIFF, or the rows"),
+    "more angles": (
+        {"angles": "0:1:9", "frames": ["stack.tif"] * 2},
+        r"expected 22, one a frame from stack\.tif to stack\.tif",
+    ),
+    "folder": ({"frames": "."}, r"a folder: give its files, such as '\./\*\.tif'"),
+    "kind": ({"kind": "grey"}, "--kind: kind: found 'grey', expected one of counts"),
+    "flats of no counts": ({"kind": "transmission", "flats": "small.tif"}, "found .* and flats"),
+    "whole transmission": ({"kind": "transmission"}, "stack.tif: pixels: found uint16, expected f"),
+    "raw": ({"frames": "frames.raw"}, r"suffix '\.raw', expected a TIFF, or rows"),
     "raw size": ({"frames": "frames.raw", **RAW}, r"size: found 101 bytes .* a multiple of 70"),
     "raw type": ({"frames": "frames.raw", **RAW, "dtype": "grey"}, "dtype: found 'grey'"),
     "no tiff": ({"frames": "bad.tif"}, "bad.tif: cannot be read as TIFF"),
@@ -185,7 +258,7 @@ def test_damaged_page_is_named(tmp_path: Path, counts: np.ndarray) -> None:
         file.seek(offset)
         file.write(b"\xff" * size)
     with pytest.raises(InputError, match=r"stack\.tif: frame 6: cannot be read"):
-        import_frames(tmp_path / "scan.nxs", path, np.arange(VIEWS), **SCANNER)
+        import_frames(tmp_path / "scan.nxs", path, "0:300:11", **SCANNER)
     assert not list(tmp_path.glob("*scan.nxs*"))
 
 
