@@ -188,7 +188,9 @@ def test_trajectories_survive_with_and_without_our_group(name: str, tmp_path: Pa
     # The rows of our trajectories count upwards, those of NXtomo downwards.
     assert scan.geometry == upside_down(geometry)
     assert scan.kind == "line-integrals"
-    np.testing.assert_array_equal(scan.read(0, len(geometry)), pixels[:, ::-1])
+    # Masked pixels were filled from beside when the scan was written.
+    used = mask[::-1]
+    np.testing.assert_array_equal(scan.read(0, len(geometry))[:, used], pixels[:, ::-1][:, used])
     np.testing.assert_array_equal(scan.mask, mask[::-1])
     np.testing.assert_array_equal(scan.truth.shift_u, truth.shift_u)
     np.testing.assert_array_equal(scan.truth.shift_v, -truth.shift_v)
