@@ -126,9 +126,10 @@ def align(
     still = None if reference is None else reading.scan(reference)
     earlier = None if start is None else Record.load(start)
     if earlier is not None and start is not None:
-        opened = matched(opened, earlier, start)
+        opened = matched(opened, earlier, start, reading.geometry())
     about = {
         "file": str(scan.absolute()),
+        "geometry": reading.geometry(),
         "estimate": estimate,
         "unobservable": "taken out" if gauge == "anchored" and method != "reference" else "left in",
         "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
@@ -219,7 +220,7 @@ def correct(
 
     limits = memory.limits()
     opened = reading.scan(scan)
-    opened, known, believed = motion_for(opened, motion)
+    opened, known, believed = motion_for(opened, motion, reading.geometry())
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns, keep=(scan, motion))
     with console.progress() as progress:
@@ -268,7 +269,7 @@ def report(
     ensure_writable(out, keep=(motion, scan))
     opened = None if scan is None else reading.scan(scan)
     if opened is not None:
-        opened = matched(opened, record, motion)
+        opened = matched(opened, record, motion, reading.geometry())
     with console.progress() as progress:
         findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
     write_report(out, findings)

@@ -129,7 +129,7 @@ def reconstruct(
     sorted_options(method, options)
     known = believed = None
     if motion is not None:
-        opened, known, believed = motion_for(opened, motion)
+        opened, known, believed = motion_for(opened, motion, reading.geometry())
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
     steps: tuple[Step, ...] = ()

@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 
@@ -124,9 +124,10 @@ class Reading:
 
     def scan(self, path: Path) -> "Scan":
         """Open a scan; its radiographs are read when they are needed."""
+        from clra.app.plausible import warn_of_scale
         from clra.io.scans import read_scan
 
-        return read_scan(
+        scan = read_scan(
             path,
             entry=self.entry,
             rotation=self.rotation,
@@ -134,6 +135,13 @@ class Reading:
             parallel=self.parallel,
             white=self.white,
         )
+        warn_of_scale(scan)
+        return scan
+
+    def geometry(self) -> str:
+        """Say by which options the geometry was told, if by any."""
+        told = replace(self, entry=None, white=None).as_typed().strip()
+        return told or "no --rotation, --source-distance or --parallel"
 
     def as_typed(self) -> str:
         """Return the options that were given, as on the command line."""

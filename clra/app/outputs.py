@@ -50,7 +50,9 @@ def room_for(
         raise OutputError.writing(path, errno.ENOSPC, found)
 
 
-def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, NDArray[np.bool_]]:
+def motion_for(
+    scan: Scan, path: str | os.PathLike[str], geometry: str
+) -> tuple[Scan, Motion, NDArray[np.bool_]]:
     """Read the motion of a scan, and take the panel as the alignment took it.
 
     Parameters
@@ -59,6 +61,8 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, 
         That it has to fit.
     path : path-like
         MOTION.h5.
+    geometry : str
+        By which options the scan's geometry was told.
 
     Returns
     -------
@@ -76,7 +80,7 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, 
         other radiographs is only worth a warning: two channels of a scan share a motion.
     """
     file = read_motion_file(path)
-    _check(scan, file.motion, file.attributes.get("checksum", ""), path)
+    _check(scan, file.motion, file.attributes, path, geometry)
     believed = all_but(file.flagged, scan.views)
     if not believed.any():
         found = f"all {scan.views} views"
@@ -84,12 +88,12 @@ def motion_for(scan: Scan, path: str | os.PathLike[str]) -> tuple[Scan, Motion, 
     return focused(scan, file.attributes, path), file.motion, believed
 
 
-def matched(scan: Scan, record: Record, path: str | os.PathLike[str]) -> Scan:
+def matched(scan: Scan, record: Record, path: str | os.PathLike[str], geometry: str) -> Scan:
     """Check that an alignment and a scan belong together, and return the scan as aligned.
 
     As :func:`motion_for` does.
     """
-    _check(scan, record.motion, record.about.get("checksum", ""), path)
+    _check(scan, record.motion, record.about, path, geometry)
     return focused(scan, record.about, path)
 
 
@@ -115,13 +119,26 @@ def focused(scan: Scan, attributes: Mapping[str, str], path: str | os.PathLike[s
     return Focus(offset, math.radians(tilt), sharpening).applied(scan)
 
 
-def _check(scan: Scan, motion: Motion, checksum: str, path: str | os.PathLike[str]) -> None:
+def _check(
+    scan: Scan,
+    motion: Motion,
+    attributes: Mapping[str, str],
+    path: str | os.PathLike[str],
+    geometry: str,
+) -> None:
     if motion.views != scan.views:
         raise InputError.at(
             path, "/motion", f"{motion.views} views", f"{scan.views} as in {scan.name}"
         )
-    if checksum and checksum != scan_checksum(scan):
+    if attributes.get("checksum") and attributes["checksum"] != scan_checksum(scan):
         warnings.warn(
             f"{os.fspath(path)} was estimated from other radiographs than those of {scan.name}",
+            stacklevel=3,
+        )
+    told = attributes.get("geometry") or geometry
+    if told != geometry:
+        warnings.warn(
+            f"{os.fspath(path)} was estimated with {told}, and now {scan.name} is read with "
+            f"{geometry}: the motion fits one of them only",
             stacklevel=3,
         )

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,8 +14,9 @@ import tifffile
 
 from clra.app import demo
 from clra.app.records import Record
-from clra.app.simulate import sample
+from clra.app.simulate import paper_like, sample
 from clra.io.motions import write_motion_file
+from clra.io.nxtomo_writing import write_nxtomo
 from clra.io.scans import read_scan, write_scan
 from clra.io.volumes import read_volume
 from clra.methods.autofocus import Focus
@@ -315,6 +317,40 @@ def test_nothing_that_is_read_is_overwritten(clra, scan_file, motion_file, monke
     ):
         refused(clra(*arguments), 2, "cannot write", "give another name")
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_motion_found_with_another_geometry_is_warned_of(clra, record, scan_file, tmp_path):
+    path, out = tmp_path / "m.h5", tmp_path / "c.nxs"
+    about = {**record.about, "geometry": "--rotation cw"}
+    replace(record, about=about).save(path)
+    for options in ((), ("--source-distance", 5.0), ("--rotation", "cw")):
+        code, _, err = clra("correct", scan_file, "--motion", path, "-o", out, "-q", *options)
+        assert code == 0
+        assert err.count("estimated with --rotation cw, and now") == ("cw" not in options)
+        assert all(line.startswith("warning: ") for line in err.splitlines())
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(
+    ("counts", "told"),
+    [
+        (lambda t: 20 + 1000 * t, ""),
+        (lambda t: t, "are not brighter than the darks"),
+        (lambda t: 20 - 1000 * np.log(t), "more than 1.5 times as bright as the open beam"),
+    ],
+    ids=["counts", "transmission", "line integrals"],
+)
+def test_radiographs_that_the_flats_are_not_of_are_noticed(clra, counts, told, tmp_path):
+    transmission = np.random.default_rng(0).uniform(0.1, 1, (9, 16, 18))
+    geometry = paper_like("circular", 9, (16, 18))
+    frame = np.ones((1, 16, 18))
+    scan = tmp_path / "scan.nxs"
+    flats, darks = 1020 * frame, 20 * frame
+    write_nxtomo(scan, counts(transmission), geometry, flats=flats, darks=darks)
+    code, _, err = clra("info", scan, "-q")
+    assert code == 0, err
+    assert told in err and err.count("\n") == bool(told)
 
 
 @pytest.mark.filterwarnings("default")
