@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from clra.methods.outliers import handed_on
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.model.turn import angle_weights
 from clra.model.visibility import runs, views_that_see
 from clra.ops.coverage import Coverage, around
 from clra.ops.filtering import FADE, RampFilter, taper
@@ -34,8 +35,10 @@ def ramp_fbp(
 
     ``f(x) = pi / W(x) sum_i w_i(x) (SOD / U_i(x))^2 q_i(x)``: q_i is the cosine-weighted,
     ramp-filtered radiograph, U_i the depth of x below the source, w_i the weight of the row that x
-    falls on, and W = sum_i w_i the number of views that see x. For a full circle this is FDK [1]_;
-    elsewhere intensities are a few per cent off, edges are where they belong.
+    falls on, and W = sum_i w_i the number of views that see x. For full circles this is FDK [1]_,
+    views that do not stand evenly having the weight of the angle that each stands for; elsewhere
+    intensities are a few per cent off, for a part of a circle up to a fifth, edges are where they
+    belong.
 
     Parameters
     ----------
@@ -75,7 +78,7 @@ def ramp_fbp(
     row_weight = taper(geometry.rows, FADE)
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
     chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
-    weight = handed_on(geometry.source, chosen)
+    weight = handed_on(geometry.source, chosen) * angle_weights(geometry)
     ramp = RampFilter(context, geometry, row_weight=row_weight, view_weight=weight, **memory)
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])

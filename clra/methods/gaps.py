@@ -25,8 +25,9 @@ def without_gaps(scan: Scan, believed: NDArray[np.bool_] | None = None) -> Scan:
     Returns
     -------
     Scan
-        Line integrals, of more views than `scan` if some are missing; as it is if nothing is to be
-        done. At an end of a helix, where there is no view on one side, those of the other.
+        Line integrals, of more views than `scan` if some are missing, of fewer if some repeat each
+        other; as it is if nothing is to be done. At an end of a helix, where there is no view on
+        one side, those of the other.
 
     Raises
     ------
@@ -37,7 +38,7 @@ def without_gaps(scan: Scan, believed: NDArray[np.bool_] | None = None) -> Scan:
     helices = [part for part, _ in fit_helices(geometry)]
     if believed is not None:
         views = np.where((views >= 0) & believed[views], views, -1)
-    if (views >= 0).all():
+    if np.array_equal(views, np.arange(scan.views)):
         return scan
     return Scan(_Filled(scan, views, helices), geometry, name=scan.name, mask=scan.mask)
 

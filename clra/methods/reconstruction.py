@@ -16,7 +16,9 @@ from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
+from clra.model.pi_intervals import heights_between
 from clra.model.scan import Scan
+from clra.model.turn import part_of_a_turn
 from clra.ops.devices import choose_devices
 from clra.ops.streaming import HostPlanes, PlaneWriter, Radiographs, Report, Stream
 
@@ -167,14 +169,10 @@ def reconstruct_into(
         motion = aligned.motion
         believed = all_but(aligned.flagged, scan.views)
     if fitted is not None:
-        there = scan.views if believed is None else int(believed.sum())
-        needed = sum(views.stop - views.start for views, _ in fitted[0])
-        if there < needed:
-            warnings.warn(
-                f"katsevich needs every view: {needed - there} of {needed} that are missing or not "
-                "believed are interpolated from those beside",
-                stacklevel=2,
-            )
+        _warn_of_gaps(fitted, grid, scan.views if believed is None else int(believed.sum()))
+    note = part_of_a_turn(scan.geometry) if method == "fbp" else ""
+    if note:
+        warnings.warn(note, stacklevel=2)
     if method in iterative.METHODS:
         stream = Stream(devices[0], report=progress, **limits)
         iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)
@@ -205,3 +203,24 @@ def reconstruct_into(
         work(stream, slice(0, grid.shape[0]), target)
     else:
         on_devices(devices, work, grid.shape[0], target, progress=progress, **limits)
+
+
+def _warn_of_gaps(fitted: Exact, grid: VolumeGrid, there: int) -> None:
+    """Warn of views that stand in for others, and of heights that no helix holds."""
+    helical = fitted[0]
+    needed = sum(views.stop - views.start for views, _ in helical)
+    if there < needed:
+        warnings.warn(
+            f"katsevich needs every view: {needed - there} of {needed} that are missing or not "
+            "believed are interpolated from those beside",
+            stacklevel=3,
+        )
+    between = heights_between([helix for _, helix in helical], grid)
+    if between is not None:
+        ends = ", ".join(f"{views.start} to {views.stop - 1}" for views, _ in helical)
+        warnings.warn(
+            f"katsevich: none of {len(helical)} helices (views {ends}) holds the pi-intervals of "
+            f"heights {between[0]:.4g} to {between[1]:.4g} mm between them, which are 0; if views "
+            "are missing there, use method 'fbp'",
+            stacklevel=3,
+        )

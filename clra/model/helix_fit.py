@@ -49,7 +49,7 @@ def fit_helices(geometry: ConeBeamGeometry) -> list[tuple[slice, Helix]]:
         raise ValueError(
             "trajectory: found no rise along the rotation axis, expected a helix; use method 'fbp'"
         )
-    if usual[0] > LARGEST_STEP:
+    if usual[0] > LARGEST_STEP * (1 + 1e-9):  # 60 views a turn, rounded, will do
         raise ValueError(
             f"trajectory: found {math.degrees(usual[0]):.4g} degrees from view to view, expected "
             f"a helix of at most {math.degrees(LARGEST_STEP):g}; use method 'fbp'"

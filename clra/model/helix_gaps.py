@@ -1,4 +1,4 @@
-"""Views that a helix lacks, such as frames that the instrument marked invalid."""
+"""Views that a helix lacks, such as frames marked invalid, or has twice, such as retaken ones."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,13 @@ _OFF = 0.25
 def completed(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, NDArray[np.int64]]:
     """Put in the views that helices lack: one at a place, or as many as 6 degrees hold.
 
-    Wider gaps stay: what lies between their ends says nothing of what is missing.
+    Of views that repeat each other the last stays. Wider gaps stay: what lies between their ends
+    says nothing of what is missing.
 
     Parameters
     ----------
     geometry : ConeBeamGeometry
-        Of any trajectory; one without such gaps comes back as it is.
+        Of any trajectory; one without such gaps and repetitions comes back as it is.
 
     Returns
     -------
@@ -35,6 +36,11 @@ def completed(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, NDArray[np.
     views = np.arange(geometry.views)
     if not (turn > 0 and rise > 0):
         return geometry, views
+    repeated = (np.abs(turned) < _OFF * turn) & (np.abs(raised) < _OFF * rise)
+    if repeated.any():
+        kept = np.flatnonzero(~np.append(repeated, False))
+        once, chosen = completed(geometry.subset(kept))
+        return once, np.where(chosen >= 0, kept[chosen], -1)
     regular = (np.abs(np.abs(turned) - turn) < _OFF * turn) & (
         np.abs(np.abs(raised) - rise) < _OFF * rise
     )

@@ -141,6 +141,33 @@ def pi_spans(helix: Helix, grid: VolumeGrid, radius: float) -> NDArray[np.float3
     return spans
 
 
+def heights_between(helices: Sequence[Helix], grid: VolumeGrid) -> tuple[float, float] | None:
+    """Heights of a grid that lie between helices, where none of them holds a pi-interval.
+
+    Parameters
+    ----------
+    helices : sequence of Helix
+        Of the scan.
+    grid : VolumeGrid
+        Of the volume.
+
+    Returns
+    -------
+    (float, float) or None
+        Lowest and highest such height on the axis [mm].
+    """
+    size, z = grid.voxel_size, grid.coordinates()[2]
+    axis = VolumeGrid(shape=(1, 1, 1), voxel_size=size, centre=(0.0, 0.0, float(z[0])))
+    spans = [pi_spans(helix.between(), axis, size)[0, 0].astype(float) for helix in helices]
+    held = np.array([span for span in spans if span[0] <= span[1]]).reshape(-1, 2)
+    if not len(held):
+        return None
+    planes = np.arange(len(z))[:, None]
+    inside = ((planes >= held[:, 0]) & (planes <= held[:, 1])).any(axis=1)
+    missing = z[~inside & (planes[:, 0] > held.min()) & (planes[:, 0] < held.max())]
+    return (float(missing[0]), float(missing[-1])) if len(missing) else None
+
+
 def _window(helix: Helix, view: int, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Lowest and highest z at (x, y) in the window of a view, with its soft borders [mm]."""
     ahead, behind, depth = helix.pi_heights(view, x, y)

@@ -1,6 +1,7 @@
 """Views and pixels that a reconstruction is told to leave out."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -84,6 +85,33 @@ def test_katsevich_puts_what_lies_between_in_place_of_them(scan, value):
     with pytest.warns(UserWarning, match="needs every view: 3 of 121"):
         again = clra.reconstruct(missing, "katsevich", grid)
     assert rms(again) == pytest.approx(rms(found), rel=0.01)
+
+
+def test_katsevich_takes_the_last_of_a_view_that_was_repeated(scan):
+    views = np.sort(np.append(np.arange(121), 60))
+    twice = clra.Scan(scan.read(0, 121)[views], scan.geometry.subset(views))
+    twice.projections[60] = 9.0  # it was taken again because it had failed
+    grid = default_grid(scan.geometry)
+    expected = clra.reconstruct(scan, "katsevich", grid)
+    assert np.abs(clra.reconstruct(twice, "katsevich", grid) - expected).max() < 1e-5
+    assert (expected > 0.5).mean() > 0.05
+
+
+def test_katsevich_says_what_lies_between_the_parts_of_a_broken_helix(scan):
+    panel = {"source_to_axis": 4.0, "source_to_detector": 8.0, "pixel_size": 0.06}
+    step = math.radians(5.9)
+    whole = clra.helix(260, angle_step=step, z_step=0.008, shape=scan.geometry.shape, **panel)
+    broken = whole.subset(np.r_[:124, 136:260])
+    grid = default_grid(broken)
+    with pytest.warns(UserWarning, match=r"2 helices \(views 0 to 123, 124 to 247\)") as said:
+        volume = clra.reconstruct(clra.Scan(BODY.line_integrals(broken), broken), "katsevich", grid)
+    told = re.search("heights (.*) to (.*) mm", str(said[0].message))
+    assert told is not None
+    z = grid.coordinates()[2]
+    axis = volume[:, grid.shape[1] // 2, grid.shape[2] // 2]
+    empty = z[(axis == 0) & (np.abs(z) < 0.5)]
+    expected = pytest.approx([empty[0], empty[-1]], abs=2 * grid.voxel_size)
+    assert [float(height) for height in told.groups()] == expected
 
 
 @pytest.mark.parametrize(

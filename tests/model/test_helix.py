@@ -151,6 +151,12 @@ def _moved(view: int, distance: float) -> ConeBeamGeometry:
     )
 
 
+def test_sixty_views_a_turn_are_enough():
+    panel = {"source_to_axis": 4.0, "source_to_detector": 8.0, "pixel_size": 0.1, "shape": (9, 9)}
+    helix = clra.helix(120, angle_step=2 * math.pi / 60, z_step=0.05, **panel)
+    assert len(fit_helices(helix)) == 1
+
+
 def test_what_is_no_helix():
     circle = clra.circular(40, **PANEL)
     with pytest.raises(ValueError, match=r"no rise .* expected a helix"):

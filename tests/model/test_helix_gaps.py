@@ -64,3 +64,12 @@ def test_other_trajectories_stay_as_they_are(geometry):
     found, views = completed(geometry)
     assert found is geometry
     assert views.tolist() == list(range(geometry.views))
+
+
+@pytest.mark.parametrize("step", [0.03, -0.03])
+def test_the_last_of_views_that_repeat_each_other_stays(step):
+    whole = _helix(step=step)
+    found, views = completed(whole.subset([0, *range(40), 39, 39, *range(41, 90)]))
+    _is(found, whole)
+    # Frame 0 was taken twice, 39 three times, 40 not at all.
+    assert views.tolist() == [*range(1, 40), 42, -1, *range(43, 92)]

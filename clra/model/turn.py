@@ -1,0 +1,101 @@
+"""Circular scans whose views are not spread evenly over the turn, or cover a part of it only."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.model.geometry import ConeBeamGeometry
+
+Floats = NDArray[np.float64]
+
+# Part of the panel's height, as seen at the axis, by which sources may rise and still be a circle.
+_FLAT = 0.05
+# Views stand evenly if no two differ more than this in the angle that they stand for.
+_EVEN = 1.05
+# A gap in the angles this many times as wide as nearly all others, and at least so wide [rad], is
+# where there are no views: those beside it do not stand for it.
+_HOLE, _NEARLY_ALL, _LEAST = 3.0, 0.99, math.radians(10.0)
+# Views over which the angle that each stands for is averaged, at most: turns that do not repeat
+# exactly would else give one view the weight of its neighbours in another turn.
+_AVERAGED = 9
+# Half the fan below which a beam is as good as parallel [rad].
+_PARALLEL = math.radians(0.5)
+
+
+def angle_weights(geometry: ConeBeamGeometry) -> Floats:
+    """Weights of the views of a circle by the part of the turn that each stands for.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of any trajectory, views in any order.
+
+    Returns
+    -------
+    ndarray, (views,)
+        Mean 1; all 1 where the trajectory is no circle or its views stand evenly, be it on a part
+        of the turn only.
+    """
+    weights = np.ones(geometry.views)
+    if geometry.views < 2 or not _is_circle(geometry):
+        return weights
+    order, gaps, step = _gaps(geometry)
+    gaps = np.where(_hole(gaps, step), step, gaps)
+    stands_for = 0.5 * (gaps + np.roll(gaps, 1))
+    reach = min(_AVERAGED, 1 + 2 * (geometry.views // 32)) // 2
+    averaged = np.mean([np.roll(stands_for, k) for k in range(-reach, reach + 1)], axis=0)
+    if averaged.max() <= _EVEN * averaged.min():
+        return weights
+    weights[order] = averaged / averaged.mean()
+    return weights
+
+
+def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
+    """Say so if ramp-filtered back-projection sees some rays of a circle twice and some once.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of any trajectory.
+
+    Returns
+    -------
+    str
+        Empty if all is well: no circle, a whole turn, or half a turn of a parallel beam.
+    """
+    if geometry.views < 2 or not _is_circle(geometry):
+        return ""
+    _, gaps, step = _gaps(geometry)
+    hole = _hole(gaps, step)
+    covered = 2 * math.pi - float(np.sum(gaps[hole] - step))
+    width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
+    parallel = 0.5 * float(np.median(width)) < _PARALLEL
+    if not hole.any() or (parallel and abs(covered - math.pi) < 2 * step):
+        return ""
+    return (
+        f"fbp counts rays that are seen from both sides twice: views cover "
+        f"{math.degrees(covered):.0f} degrees of the circle, expected "
+        f"{'180 or ' if parallel else ''}360; intensities may be off by a fifth, less by method "
+        "'osem-tr' or 'imgr'"
+    )
+
+
+def _is_circle(geometry: ConeBeamGeometry) -> bool:
+    height = geometry.rows * np.linalg.norm(geometry.v, axis=1)
+    at_axis = np.abs(geometry.source_to_axis / geometry.source_to_detector) * height
+    return bool(np.ptp(geometry.source[:, 2]) <= _FLAT * np.median(at_axis))
+
+
+def _gaps(geometry: ConeBeamGeometry) -> tuple[NDArray[np.intp], Floats, float]:
+    """Sort views by angle; also the gap from each to the next, and how wide gaps are."""
+    angle = np.arctan2(geometry.source[:, 0], -geometry.source[:, 1]) % (2 * np.pi)
+    order = np.argsort(angle, kind="stable")
+    gaps = np.diff(angle[order], append=angle[order[0]] + 2 * np.pi)
+    return order, gaps, float(np.quantile(gaps, _NEARLY_ALL, method="lower"))
+
+
+def _hole(gaps: Floats, step: float) -> NDArray[np.bool_]:
+    return np.asarray(gaps > max(_HOLE * step, _LEAST))
