@@ -97,6 +97,9 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    for name, given in (("motion", motion), ("truth", truth)):
+        if given is not None and given.views != scan.views:
+            raise ValueError(f"{name}: found {given.views} views, expected {scan.views}")
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise ValueError(f"reference, motion: found {found}, expected one of them")

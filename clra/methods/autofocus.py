@@ -27,6 +27,7 @@ from clra.model.scan import Scan
 from clra.model.schedule import level_name
 from clra.ops.filtering import RampFilter, taper
 from clra.ops.projector import BackProjector
+from clra.ops.registration import SMALLEST
 from clra.ops.streaming import Radiographs, Report, Stream
 
 Floats = NDArray[np.float64]
@@ -43,8 +44,8 @@ _PLANES, _REACH = 7, 0.8
 # Part of the field of view's radius in which sharpness counts, in the search and in the refinement:
 # with a large offset its border gets edges of its own, which outdo those of a round sample.
 _SEARCH_INSIDE, _INSIDE = 0.7, 0.9
-# Iterations of the short alignment, and fewest rows and columns that it takes.
-_ITERATIONS, _SMALLEST = 2, 16
+# Iterations of the short alignment.
+_ITERATIONS = 2
 # Rounds of the refinement: offset and tilt in turn, by parabolas through points first this far
 # apart [pixel of the level, rad] and in each round closer.
 _ROUNDS, _STEPS, _SHRINK = 4, (0.5, np.radians(0.5)), 0.5
@@ -165,7 +166,7 @@ def _searched(slices: "_Slices", scan: Scan) -> tuple[float, float]:
 
 def _level(scan: Scan, level: int) -> int:
     """Return the level, or a finer one if it leaves too few rows or columns."""
-    while level > 1 and min(scan.geometry.shape) // level < _SMALLEST:
+    while level > 1 and min(scan.geometry.shape) // level < SMALLEST:
         level //= 2
     return level
 

@@ -33,7 +33,7 @@ from clra.model.grid import default_grid
 from clra.model.matching import match_views
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.registration import ESTIMATE_FIELDS
+from clra.ops.registration import ESTIMATE_FIELDS, SMALLEST
 from clra.ops.streaming import Radiographs, Stream
 
 Floats = NDArray[np.float64]
@@ -48,8 +48,6 @@ _POINTS = 40
 # Resolutions at which pairs are registered: a quarter catches drifts of 64 pixels; full resolution,
 # of radiographs corrected by that, is ten times as good on panels of 128 columns.
 _LEVELS = (4, 1)
-# Fewest rows and columns that can be registered.
-_SMALLEST = 16
 
 
 def align_to_reference(
@@ -187,7 +185,7 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
 def _registered(stream: Stream, scan: Scan, reference: Scan, scale: bool) -> Registered:
     """Register each view of the scan with the reference view of the same number."""
     known = Motion.identity(scan.views)
-    levels = [n for n in _LEVELS if min(scan.geometry.shape) // n >= _SMALLEST or n == 1]
+    levels = [n for n in _LEVELS if min(scan.geometry.shape) // n >= SMALLEST or n == 1]
     for level in levels:
         nearer = scan if level == levels[0] else corrected(stream, scan, known)
         measured, still = (Radiographs(stream, s, level) for s in (nearer, reference))

@@ -11,8 +11,9 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
+from clra.model.schedule import level_name
 from clra.ops.correlation import PhaseCorrelation
-from clra.ops.registration import ESTIMATE_FIELDS, Registration
+from clra.ops.registration import ESTIMATE_FIELDS, SMALLEST, Registration
 from clra.ops.slabs import SlabProjector
 from clra.ops.streaming import Radiographs, Stream, Volume
 
@@ -97,8 +98,19 @@ def registration_for(
         Its expected spread, as for `Registration`.
     still : bool
         Compare the radiographs where they are: gain, offset and sharpness alone are fitted.
+
+    Raises
+    ------
+    ValueError
+        If radiographs of the level are too small to be registered.
     """
     views, rows, columns = radiographs.shape
+    if min(rows, columns) < SMALLEST:
+        raise ValueError(
+            f"{scan.name}: panel: found {scan.geometry.rows} x {scan.geometry.columns} pixels, "
+            f"{rows} x {columns} at {level_name(radiographs.level)}, expected at least {SMALLEST} "
+            "rows and columns there to register; start at a finer level, such as with schedule 4FR"
+        )
     low_pass, high_pass = band_of((rows, columns), first=first)
     chunks = stream.chunks(views, radiographs.view_bytes)
     return Registration(

@@ -231,7 +231,10 @@ class ConeBeamGeometry:
         factor = whole("factor", factor)
         rows, columns = self.rows // factor, self.columns // factor
         if not rows or not columns:
-            raise ValueError(f"factor: found {factor}, expected at most {min(self.shape)}")
+            raise ValueError(
+                f"factor: found {factor}, expected at most {min(self.shape)} to bin "
+                f"{self.rows} x {self.columns} pixels"
+            )
         lost_u, lost_v = self.columns - columns * factor, self.rows - rows * factor
         return ConeBeamGeometry(
             source=self.source,

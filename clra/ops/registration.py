@@ -30,6 +30,9 @@ ESTIMATE_FIELDS = (
     "sigma_m",
 )
 
+SMALLEST = 16
+"""Fewest rows and columns of images that can be registered."""
+
 # As kernels/registration.cl has them: floats of a view's state, sums of its normal equations.
 _STATE, _SUMS = 8, 36
 
@@ -150,8 +153,8 @@ class Registration:
         scratch_limit: int | None = None,
     ) -> None:
         rows, columns = self.shape = shape
-        if min(shape) < 16:
-            raise ValueError(f"shape: found {shape}, expected at least 16 rows and columns")
+        if min(shape) < SMALLEST:
+            raise ValueError(f"shape: found {shape}, expected at least {SMALLEST} rows and columns")
         if iterations < 1:
             raise ValueError(f"iterations: found {iterations}, expected 1 or more")
         if not max_shift > 0:

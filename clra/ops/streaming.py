@@ -299,8 +299,7 @@ class Radiographs:
     """
 
     def __init__(self, stream: Stream, scan: Scan, level: int) -> None:
-        views, rows, columns = scan.shape
-        self.shape = (views, rows // level, columns // level)
+        self.shape = (scan.views, *scan.geometry.binned(level).shape)
         self.level = level
         self._stream, self._scan = stream, scan
         self._kept: Store | None = None if level == 1 else self._read_all()

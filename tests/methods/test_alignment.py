@@ -201,6 +201,8 @@ def test_progress_names_stage_and_counts(moved):
         ({"estimate": "tilt"}, "estimate: found 'tilt'"),
         ({"schedule": "3XR"}, "schedule: found '3XR'"),
         ({"gauge": "tight"}, "gauge: found 'tight'"),
+        ({"motion": clra.Motion.identity(7)}, "motion: found 7 views, expected"),
+        ({"truth": clra.Motion.identity(7)}, "truth: found 7 views, expected"),
     ],
 )
 def test_options_that_are_none(moved, options, message):
@@ -211,3 +213,20 @@ def test_options_that_are_none(moved, options, message):
 def test_one_view_cannot_be_aligned(moved):
     with pytest.raises(ValueError, match="found 1 view, expected at least 2"):
         clra.align(moved.subset([3]))
+
+
+@pytest.mark.parametrize(
+    ("shape", "method", "message"),
+    [
+        ((40, 90), "ra", "line: panel: found 40 x 90 pixels, 10 x 22 at QR, expected at least 16"),
+        ((40, 90), "imgr", "line: panel: found 40 x 90 pixels, 10 x 22 at QR, expected at least"),
+        ((1, 90), "ra", "factor: found 4, expected at most 1 to bin 1 x 90 pixels"),
+    ],
+)
+def test_panels_too_small_for_a_level(shape, method, message):
+    geometry = clra.circular(
+        5, source_to_axis=9.0, source_to_detector=20.0, pixel_size=0.05, shape=shape
+    )
+    scan = clra.Scan(np.ones((5, *shape), np.float32), geometry, name="line")
+    with pytest.raises(ValueError, match=message):
+        clra.align(scan, method=method)
