@@ -52,7 +52,7 @@ def test_the_scan_is_the_papers(figure, wood):
 
 def test_align_and_reconstruct_by_one_command(figure, wood, tmp_path, clra):
     """Chain `--align`; then `--motion` with the true one, and no motion, to compare with."""
-    path, known = tmp_path / "wood.nxs", tmp_path / "true.h5"
+    path, known = tmp_path / "wood.nxs", tmp_path / "motion.h5"
     write_scan(path, wood)
     wood.truth.save(known)
     grid = default_grid(read_scan(path).geometry)
