@@ -1,5 +1,7 @@
 """The commands that align, correct, reconstruct and report."""
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -98,11 +100,13 @@ def align(
     from clra.app.errors import InterruptedCommandError
     from clra.app.findings import Errors, findings_of, summary_of
     from clra.app.outputs import focus_attributes, matched
+    from clra.app.plausible import doubt_of_turning
     from clra.app.records import Record
     from clra.io.atomic import ensure_writable
     from clra.io.volumes import write_volume
     from clra.methods.alignment import align as align_scan
     from clra.methods.autofocus import autofocus as find_focus
+    from clra.methods.autofocus import sharpening_by_turning_back
     from clra.methods.results import AlignmentInterrupted
     from clra.model.grid import default_grid
     from clra.model.schedule import parse_levels, parse_schedule
@@ -167,6 +171,17 @@ def align(
             ) from None
         record = Record.of(result, opened, earlier, **about)
         record.save(out)
+        turned = sharpening_by_turning_back(
+            opened.cropped(),
+            result.motion.about(*opened.window_aside),
+            console.device,
+            progress=progress,
+            **limits,
+        )
+        more = {"sharpening_by_turning_back": f"{turned:.3f}"}
+        record = replace(record, about={**record.about, **more})
+        record.save(out)
+        doubts = [doubt_of_turning(turned)]
         errors = Errors.of(record, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
@@ -183,9 +198,12 @@ def align(
                 **limits,
             )
             write_report(report, findings)
+            doubts += set(findings.notes) - set(record.notes)
+    for doubt in filter(None, doubts):
+        warnings.warn(doubt, stacklevel=1)
     values, text = summary_of(record, errors)
-    more = {"volume": volume, "report": report}
-    written = {"file": out, **{name: path for name, path in more.items() if path}}
+    beside = {"volume": volume, "report": report}
+    written = {"file": out, **{name: path for name, path in beside.items() if path}}
     names = " and ".join(str(path) for path in written.values())
     console.summary({**written, **values}, f"wrote {names}\n{text}")
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.app.describe import Facts, table, views_flagged
+from clra.app.plausible import doubt_of_shifts
 from clra.app.progress import duration
 from clra.app.records import Record
 from clra.model.gauge import Gauge, sample_points
@@ -99,6 +100,12 @@ class Findings:
     comparison: "Comparison | None" = None
     facts: Mapping[str, str] = field(default_factory=dict)
     quality: "Quality | None" = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the run warned of, and what the scan itself tells against its result."""
+        doubt = "" if self.quality is None else doubt_of_shifts(self.quality, self.record.motion)
+        return (*self.record.notes, doubt) if doubt else self.record.notes
 
 
 def findings_of(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.app.describe import path_of
+from clra.app.plausible import doubt_of_turning
 from clra.io.motions import MotionFile, read_motion_file, write_motion_file
 from clra.io.scans import scan_checksum
 from clra.methods.outliers import all_but
@@ -59,7 +60,12 @@ class Record:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the run warned of."""
-        return tuple(note for step in self.history for note in step.note.splitlines())
+        told = [note for step in self.history for note in step.note.splitlines()]
+        try:
+            told.append(doubt_of_turning(float(self.about["sharpening_by_turning_back"])))
+        except (KeyError, ValueError):
+            pass  # not looked at
+        return tuple(filter(None, told))
 
     @property
     def scale_estimated(self) -> bool:

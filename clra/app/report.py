@@ -62,7 +62,11 @@ def render(findings: Findings) -> str:
     record = findings.record
     body = [
         page.cards(_cards(findings)),
-        *([page.section("Warnings", *map(page.paragraph, record.notes))] if record.notes else []),
+        *(
+            [page.section("Warnings", *map(page.paragraph, findings.notes))]
+            if findings.notes
+            else []
+        ),
         _corrections(record),
         *([_history(record.history)] if record.history else []),
         *([_errors(findings.errors)] if findings.errors else []),

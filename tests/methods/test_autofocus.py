@@ -7,10 +7,11 @@ import pytest
 
 import clra
 from clra.app.simulate import paper_like, sample, simulated_motion
-from clra.methods.autofocus import Focus, autofocus
+from clra.methods.autofocus import Focus, autofocus, sharpening_by_turning_back
 from clra.model.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.panel import with_panel
+from clra.model.turning import turned_back
 
 OFFSET, TILT = 6.0, math.radians(1.0)
 VIEWS, SHAPE = 90, (64, 64)
@@ -60,3 +61,21 @@ def test_a_focus_out_of_reach_is_said():
     still = clra.Scan(np.zeros((40, 64, 64), np.float32), paper_like("circular", 40, (64, 64)))
     with pytest.raises(ValueError, match="found no structure"):
         autofocus(still)
+
+
+@pytest.mark.parametrize("trajectory", ["circular", "space-filling"])
+def test_a_sample_that_turns_the_other_way_is_noticed(trajectory):
+    scan = _scan(trajectory, jitter=2.0)
+    motion = clra.Motion(shift_u=scan.truth.shift_u + OFFSET, shift_v=scan.truth.shift_v)
+    assert sharpening_by_turning_back(scan, motion) < 0.8
+    mirrored = clra.Scan(scan.projections, turned_back(scan.geometry))
+    assert sharpening_by_turning_back(mirrored, motion) > 1.2
+
+
+def test_a_parallel_beam_does_not_tell_how_the_sample_turns():
+    far = clra.circular(
+        VIEWS, source_to_axis=1e6, source_to_detector=1e6, pixel_size=0.1, shape=SHAPE
+    )
+    scan = clra.Scan(sample("porous", far, 1).line_integrals(far), far)
+    still = clra.Motion.identity(VIEWS)
+    assert sharpening_by_turning_back(scan, still) == pytest.approx(1.0, abs=0.005)
