@@ -40,18 +40,6 @@ class Anderson:
         self._last: tuple[Floats, Floats] | None = None
         self._differences: list[tuple[Floats, Floats]] = []
 
-    def forget(self) -> None:
-        """Go on as if no steps had been made."""
-        self._last, self._differences = None, []
-
-    def restart(self) -> None:
-        """Go on with another f whose differences resemble those of the one before.
-
-        What an iteration at one resolution learnt of slow modes holds at the next one, but the step
-        across says more of the two levels' errors than of either.
-        """
-        self._last = None
-
     def next(self, x: Floats, f: Floats) -> Floats:
         """Return the next point.
 
@@ -123,14 +111,6 @@ class MotionSteps:
             cause=here.cause,
         )
         return motion.normalised()
-
-    def restart(self) -> None:
-        """Go on at another level, see :meth:`Anderson.restart`."""
-        self._anderson.restart()
-
-    def forget(self) -> None:
-        """Go on as if nothing were known of earlier steps."""
-        self._anderson.forget()
 
     def _as_lengths(self, motion: Motion) -> Floats:
         rows = [motion.shift_u, motion.shift_v]

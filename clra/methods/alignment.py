@@ -51,7 +51,7 @@ def align(
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
         panel of 384 pixels and more "6ER-3QR", else a quarter of the resolution until converged (at
-        most 6 iterations), then half until converged (at most 3, often one). For "imgr" the levels
+        most 20 iterations), then half until converged (at most 3, often one). For "imgr" the levels
         of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the

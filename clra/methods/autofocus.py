@@ -12,7 +12,6 @@ References
    of tomographic projection data by passive auto-focus", Med. Phys. 38, 4934 (2011).
 """
 
-import math
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment import align
-from clra.model.arcs import covered
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -109,16 +107,8 @@ def autofocus(
     Raises
     ------
     ValueError
-        If views cover less than a turn, the best lies at the end of what is searched, or slices
-        have no structure.
+        If the best lies at the end of what is searched, or slices have no structure.
     """
-    angle = covered(scan.geometry)
-    if angle < 2 * math.pi:
-        # Slices of half a turn are sharpest with a panel tilted by 3 degrees too much.
-        raise ValueError(
-            f"{scan.name}: found views over {math.degrees(angle):.0f} degrees, expected a whole "
-            "turn to find the axis and the panel's tilt by"
-        )
     limits: dict[str, Any] = {
         "max_device_memory": max_device_memory,
         "max_host_memory": max_host_memory,

@@ -72,12 +72,11 @@ class CoarseToFine:
     found: Motion = field(init=False)  # by the last iteration, with its gauge
     last: tuple[int, Floats] = field(init=False)  # its level, and updates of views believed
     fresh: bool = field(init=False)  # nothing was known of the motion before it
+    steps: MotionSteps = field(init=False)  # of the level
     weak: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
         self.motion = self.start
-        shape = self.scan.geometry.shape
-        self.steps = MotionSteps(self.solver.acceleration(), shape, self.scale)
         points = sample_points(self.grid)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
@@ -102,7 +101,10 @@ class CoarseToFine:
         level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
         if not self.history:
             self.weak = odd_radiographs(self.stream, level.radiographs)
-        self.steps.restart()
+        # Each level ends a little aside of the one before: extrapolated by the last, short steps of
+        # that one, its first steps would go astray.
+        steps = self.solver.acceleration()
+        self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
         previous = None
         for iteration in range(1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
@@ -130,7 +132,9 @@ class CoarseToFine:
             )
             # 6, 13: until converged, whatever becomes of views that are not believed
             update_u, update_v = update[:, ~self.weak]
-            if stage.iterations is None and converged(update_u, update_v, previous):
+            if stage.iterations is None and converged(
+                update_u, update_v, previous, stage.tolerance
+            ):
                 break
             # A first step finds too little, see `_move`: the second may well find as much.
             previous = None if self.fresh else update_size(update_u, update_v)[0]
@@ -170,9 +174,6 @@ class CoarseToFine:
         else:
             note = warned(far_motion(found.motion, level))
             self.fresh = True
-        if self.fresh:
-            # What the steps so far tell of slow modes is as wrong as where they led.
-            self.steps.forget()
         self.last = level, believed
         # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.

@@ -35,8 +35,8 @@ class Solver:
         :class:`clra.ops.registration.Registration`, or the paper's: the peak of the phase
         correlation, refined by a parabola, which finds shifts only.
     memory : int
-        Steps from one iteration to the next that Anderson acceleration looks back on, also of the
-        level before; 0 for plain steps.
+        Steps from one iteration to the next of a level that Anderson acceleration looks back on; 0
+        for plain steps.
     circle : bool
         Reconstruct nothing outside the circle that all views see.
     unbias : bool

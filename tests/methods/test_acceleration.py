@@ -42,16 +42,3 @@ def test_shape_of_the_unknowns_is_kept():
         x = anderson.next(x, 1.0 - x)
     assert x.shape == (3, 5)
     assert x == pytest.approx(np.ones((3, 5)), abs=1e-2)
-
-
-def test_what_is_forgotten_counts_no_more():
-    gains, start = np.array([0.9, 0.3, 0.1]), np.array([2.0, -1.0, 4.0])
-    fresh, used = Anderson(3), Anderson(3)
-    x = start
-    for _ in range(4):
-        x = used.next(x, 1.7 * x)
-    used.forget()
-    a = b = start
-    for _ in range(3):
-        a, b = fresh.next(a, -gains * a), used.next(b, -gains * b)
-        assert np.array_equal(a, b)

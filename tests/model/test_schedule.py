@@ -13,7 +13,7 @@ from clra.model.schedule import Stage, converged, level_name, parse_schedule, up
         ("2qr-12hr", [(4, 2, 2), (2, 12, 12)]),
         ("4FR", [(1, 4, 4)]),
         ("2ER-1QR-1HR-3FR", [(8, 2, 2), (4, 1, 1), (2, 1, 1), (1, 3, 3)]),
-        ("auto", [(4, None, 6), (2, None, 3)]),
+        ("auto", [(4, None, 20, 0.02), (2, None, 3, 0.05)]),
     ],
 )
 def test_text_becomes_stages(text, stages):
@@ -46,7 +46,8 @@ def test_stages_print_as_they_are_written():
 def test_small_updates_have_converged():
     small = np.full(9, -0.09)
     assert converged(small, small)
-    assert not converged(np.full(9, 0.11), np.full(9, 0.11))
+    assert not converged(np.full(9, 0.11), 0 * small)
+    assert not converged(0 * small, np.full(9, 0.11))
     one_large = small.copy()
     one_large[4] = -0.51
     assert not converged(small, one_large)
@@ -55,7 +56,17 @@ def test_small_updates_have_converged():
 def test_updates_that_no_longer_shrink_have_converged():
     u, v = np.full(5, 0.3), np.full(5, -0.4)
     median, largest = update_size(u, v)
-    assert (median, largest) == pytest.approx((0.35, 0.4))
+    assert (median, largest) == pytest.approx((0.4, 0.4))
     assert converged(u, v, median)
     assert converged(u, v, 0.3)
-    assert not converged(u, v, 0.36)
+    assert not converged(u, v, 0.41)
+
+
+def test_slow_modes_are_waited_for():
+    slow = np.full(5, 0.03)
+    assert converged(slow, 0 * slow, 0.03)
+    assert not converged(slow, 0 * slow, 0.03, tolerance=0.02)
+    assert converged(0.5 * slow, 0 * slow, 0.03, tolerance=0.02)
+    far = np.array([0.03, 0.03, 0.03, 0.03, 0.6])
+    assert converged(far, 0 * far, 0.03, tolerance=0.02)  # one wanders
+    assert not converged(far, 0 * far, 0.04, tolerance=0.02)
