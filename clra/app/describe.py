@@ -188,8 +188,10 @@ class Facts:
         """Return name and value of each line that describes the scan to a person."""
         pixel_u, pixel_v = map(metric, self.pixel_mm)
         path = self.path
-        steps = f"{path.kind}, {path.angle_step_deg:.4g} degrees"
-        turns = f" a view, {path.turns:.4g} turns"
+        # The source goes round the other way than the sample turns.
+        sense = "clockwise" if path.angle_step_deg > 0 else "counter-clockwise"
+        steps = f"{path.kind}, {abs(path.angle_step_deg):.4g} degrees"
+        turns = f" a view, {path.turns:.4g} turns of the sample {sense} from above"
         if path.kind != "circular" and path.travel_mm:
             steps += f" and {metric(path.z_step_mm)}"
             turns += f", pitch {metric(path.pitch_mm)}, travel {metric(path.travel_mm)}"
@@ -200,10 +202,18 @@ class Facts:
             "scan": f"{self.name} ({self.kind})",
             "views": f"{self.views}",
             "panel": f"{self.rows} rows x {self.columns} columns, pixel {pixel_u} x {pixel_v}",
-            "distances": f"source to axis {metric(self.source_to_axis_mm)}, "
-            f"to detector {metric(self.source_to_detector_mm)}",
-            "magnification": f"{self.magnification:.4g}, "
-            f"fan angle {self.fan_angle_deg:.3g} degrees",
+            **(
+                {"beam": "parallel"}
+                if math.isclose(
+                    self.magnification, 1.0, rel_tol=1e-9
+                )  # no detector stands on the axis of a cone beam
+                else {
+                    "distances": f"source to axis {metric(self.source_to_axis_mm)}, "
+                    f"to detector {metric(self.source_to_detector_mm)}",
+                    "magnification": f"{self.magnification:.4g}, "
+                    f"fan angle {self.fan_angle_deg:.3g} degrees",
+                }
+            ),
             "trajectory": steps + turns,
             "volume": f"{nx} x {ny} x {nz} voxels of {metric(self.voxel_mm)}",
             "field of view": f"{metric(self.width_mm)} across, {metric(self.height_mm)} high",

@@ -15,6 +15,9 @@ from clra.io.nxgeometry import Fields, far_source_distance
 
 Floats = NDArray[np.float64]
 
+# Pixels larger than this are in other units than the file says, or says by default [mm].
+_LARGEST = 20.0
+
 
 @dataclass(frozen=True)
 class Overrides:
@@ -158,6 +161,9 @@ def _positive(dataset: h5py.Dataset) -> float:
     value = float(lengths(dataset, "the size of a pixel")[0])
     if value <= 0:
         raise InputError.at(dataset.file.filename, dataset.name, f"{value:g} mm", "above 0 mm")
+    if value > _LARGEST:
+        name = f"{dataset.file.filename}: {dataset.name}"
+        warnings.warn(f"{name}: {value:g} mm: are the units right, or missing?", stacklevel=4)
     return value
 
 

@@ -70,3 +70,17 @@ def test_lengths_have_the_unit_that_suits_them():
         "1000 m",
         "0 mm",
     ]
+
+
+def test_the_sense_of_turning_is_the_samples():
+    """Seen from the source, which goes round the other way than the sample turns."""
+    for arc, told in ((1.0, "clockwise"), (-1.0, "counter-clockwise")):
+        geometry = trajectory.circular(90, arc=2 * math.pi * arc, **COMMON)
+        line = Facts.of(Scan(np.zeros((90, 7, 9)), geometry)).lines()["trajectory"]
+        assert line == f"circular, 4 degrees a view, 1 turns of the sample {told} from above"
+
+
+def test_a_parallel_beam_is_called_so():
+    far = COMMON | {"source_to_axis": 1e5, "source_to_detector": 1e5}
+    lines = Facts.of(Scan(np.zeros((12, 7, 9)), trajectory.circular(12, **far))).lines()
+    assert lines["beam"] == "parallel" and "distances" not in lines

@@ -99,6 +99,14 @@ def test_without_units_metres_and_degrees(nxtomo_file: Builder) -> None:
     np.testing.assert_allclose(bare.to_astra(), full.to_astra(), rtol=0, atol=200 * ROUNDING)
 
 
+def test_a_pixel_of_the_wrong_unit_is_noticed(nxtomo_file: Builder) -> None:
+    def edit(entry: h5py.Group) -> None:
+        put(entry, "instrument/detector/x_pixel_size", 0.2)  # of mm, and taken as metres
+
+    with pytest.warns(UserWarning, match=r"x_pixel_size: 200 mm: are the units right"):
+        read_scan(nxtomo_file(edit))
+
+
 def test_invalid_and_control_frames_are_left_out(nxtomo_file: Builder) -> None:
     roles = ROLES.copy()
     roles[5] = 3
