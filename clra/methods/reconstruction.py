@@ -16,6 +16,7 @@ from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
+from clra.model.panel import steep_rows
 from clra.model.pi_intervals import heights_between
 from clra.model.scan import Scan
 from clra.model.turn import part_of_a_turn
@@ -170,9 +171,9 @@ def reconstruct_into(
         believed = all_but(aligned.flagged, scan.views)
     if fitted is not None:
         _warn_of_gaps(fitted, grid, scan.views if believed is None else int(believed.sum()))
-    note = part_of_a_turn(scan.geometry) if method == "fbp" else ""
-    if note:
-        warnings.warn(note, stacklevel=2)
+    if method == "fbp":
+        for note in filter(None, (part_of_a_turn(scan.geometry), steep_rows(scan.geometry))):
+            warnings.warn(note, stacklevel=2)
     if method in iterative.METHODS:
         stream = Stream(devices[0], report=progress, **limits)
         iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)

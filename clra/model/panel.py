@@ -1,10 +1,14 @@
-"""A panel that stands otherwise than the geometry says, in all views alike."""
+"""Panels that stand otherwise than the geometry says, or than ramp filters expect."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from clra.model.geometry import ConeBeamGeometry
+
+# Angle between rows and the horizontal from which on ramp-FBP is wrong by more than two per cent: a
+# compact object comes out 0.6 % too bright at 5 degrees, 2.5 % at 10, 9 % at 20, 33 % at 90.
+_STEEP = np.radians(10.0)
 
 
 def with_panel(
@@ -35,4 +39,28 @@ def with_panel(
         u=u,
         v=v,
         shape=geometry.shape,
+    )
+
+
+def steep_rows(geometry: ConeBeamGeometry) -> str:
+    """Say so if the rows of a panel run so far up and down that filtering along them is wrong.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of any trajectory about z.
+
+    Returns
+    -------
+    str
+        Empty if all is well.
+    """
+    turned = np.arcsin(np.abs(geometry.u[:, 2]) / np.linalg.norm(geometry.u, axis=1))
+    angle = float(np.median(turned))
+    if angle < _STEEP:
+        return ""
+    return (
+        f"fbp filters along the rows of the panel, which rise by {np.degrees(angle):.0f} degrees, "
+        f"expected less than {np.degrees(_STEEP):.0f}; intensities may be off by a third, not by "
+        "method 'osem-tr'"
     )

@@ -69,9 +69,11 @@ def taper(rows: int, fraction: float) -> NDArray[np.float32]:
 class RampFilter:
     """Cosine weight, ramp filter along u, and the scale that back-projection needs.
 
-    Of radiographs p of line integrals it makes ``q = SOD / (SDD |u|) (p w r) * h`` with w the
-    distance from source to panel over the length of the ray, r the row and view weights, and h the
-    band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd n, 0 for even n. With
+    Of radiographs p of line integrals it makes ``q = R / (SDD |u'|) (p w r) * h`` with R the
+    distance from source to axis, SDD that to the panel, u' what of u is across the way to the axis
+    (all of it, if the panel faces the axis), w SDD over the length of the ray, r the row and view
+    weights, and h the band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd n, 0 for
+    even n. With
     depth fractions g(x) and summed row weights W(x) the attenuation is then
     ``f(x) = pi / W(x) sum_i q_i(x) / g_i(x)^2`` for views around the whole circle. [1]_
 
@@ -256,14 +258,18 @@ def _view_table(
     """Make the table (views, 6) that filtering.cl reads."""
     distance = geometry.source_to_detector
     u, v = geometry.u / distance[:, None], geometry.v / distance[:, None]
-    pitch = np.linalg.norm(geometry.u, axis=1)
+    # Of a panel that does not face the axis, columns are closer as the axis sees them.
+    radius = np.hypot(*geometry.source[:, :2].T)
+    to_axis = -geometry.source[:, :2] / np.maximum(radius, np.finfo(float).tiny)[:, None]
+    along = np.sum(geometry.u[:, :2] * to_axis, axis=1)
+    pitch = np.sqrt(np.maximum(np.sum(geometry.u**2, axis=1) - along**2, 0.0))
     columns = [
         geometry.principal[:, 0],
         geometry.principal[:, 1],
         np.sum(u * u, axis=1),
         np.sum(v * v, axis=1),
         2 * np.sum(u * v, axis=1),
-        view_weight * geometry.source_to_axis / (distance * pitch),
+        view_weight * radius / (distance * pitch),
     ]
     return np.stack(columns, axis=1).astype(np.float32)
 

@@ -78,6 +78,33 @@ def test_views_count_by_the_angle_they_stand_for(geometry):
     assert _in_the_middle(geometry) == pytest.approx([1, 1], abs=0.01)
 
 
+def _turned(geometry, about_u=0.0, about_v=0.0, in_plane=0.0):
+    """The same with the panel turned about its column and row directions, and in its plane."""
+    u, v, normal = geometry.u, geometry.v, geometry.normal  # a pixel is 1 mm
+    for angle, one, other in ((about_u, "v", "n"), (about_v, "u", "n"), (in_plane, "u", "v")):
+        c, s, steps = math.cos(angle), math.sin(angle), {"u": u, "v": v, "n": normal}
+        turned = {one: c * steps[one] + s * steps[other], other: c * steps[other] - s * steps[one]}
+        u, v, normal = (steps | turned).values()
+    return clra.ConeBeamGeometry(
+        source=geometry.source, detector=geometry.detector, u=u, v=v, shape=geometry.shape
+    )
+
+
+@pytest.mark.parametrize(("about_u", "about_v"), [(0.2, 0), (0, 0.2), (-0.3, 0.25), (0.5, 0)])
+def test_a_panel_that_does_not_face_the_axis_changes_nothing(about_u, about_v):
+    # As if it did, 0.2 rad would take 2 % off the values about u, and 4 % about v.
+    panel = FAN | {"shape": (41, 52)}
+    geometry = _turned(clra.circular(240, **panel), about_u, about_v)
+    assert _in_the_middle(geometry) == pytest.approx([1, 1], abs=0.01)
+
+
+def test_rows_that_run_up_and_down_are_warned_of():
+    panel = FAN | {"shape": (48, 48)}
+    _in_the_middle(_turned(clra.circular(60, **panel), in_plane=0.1))
+    with pytest.warns(UserWarning, match="which rise by 90 degrees, expected less than 10"):
+        _in_the_middle(_turned(clra.circular(60, **panel), in_plane=math.pi / 2))
+
+
 def test_a_part_of_a_turn_is_warned_of():
     with pytest.warns(UserWarning, match="207 degrees of the circle, expected 360"):
         _in_the_middle(clra.circular(240, arc=math.radians(207), **FAN))
