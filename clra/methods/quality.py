@@ -31,7 +31,8 @@ class Quality:
         radiograph's own.
     half_u, half_v : float
         Median over the views of how far the shifts that two volumes ask for differ, one of them
-        from the even views and one from the odd [pixel of the full-resolution panel].
+        from every second of the views believed, one from those between [pixel of the
+        full-resolution panel].
     sharpness : float
         Mean squared gradient of the volume after, relative to before.
     """
@@ -67,7 +68,7 @@ def quality(
     level : int
         Binning factor.
     believed : ndarray of bool, (views,), optional
-        Views to reconstruct from with the motion, some even and some odd; all by default.
+        Views to reconstruct from with the motion, at least two; all by default.
     """
     used = np.ones(scan.views, np.bool_) if believed is None else believed
     grid = default_grid(scan.geometry).binned(level)
@@ -100,10 +101,11 @@ def quality(
         gradients.append(_gradient(volume.to_host()))
     halves = []
     for name, first in (("even views", 0), ("odd views", 1)):
-        half = slice(first, None, 2)
+        # Of those believed: bad ones may well be every second view.
+        half = np.flatnonzero(used)[first::2]
         part = Radiographs(stream, Scan(radiographs, after).subset(half), 1)
         stage = f"report: volume of {name}"
-        volume = ramp_fbp(stream, part, after.subset(half), grid, believed=used[half], stage=stage)
+        volume = ramp_fbp(stream, part, after.subset(half), grid, stage=stage)
         halves.append(registered(after, volume, f"from {name}", still=False).motion)
     even, odd = halves
     return Quality(

@@ -41,3 +41,10 @@ def test_without_motion_nothing_changes(moved):
     none = quality(Stream(), moved, clra.Motion.identity(VIEWS), 2)
     assert none.unexplained_after == pytest.approx(none.unexplained_before)
     assert none.sharpness == pytest.approx(1)
+
+
+def test_every_second_view_may_be_bad(moved):
+    believed = np.arange(VIEWS) % 2 == 0
+    found = quality(Stream(), moved, moved.truth, 2, believed)
+    whole = quality(Stream(), moved, moved.truth, 2)
+    assert 0 < found.half_u < 4 * whole.half_u
