@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -19,6 +20,8 @@ KINDS = ("line-integrals", "transmission")
 # Transmission below which the logarithm is cut off: a dead or fully shadowed pixel must not
 # become infinite. exp(-13.8) is far below what a real detector resolves.
 _DARKEST = 1e-6
+# Part of the pixels of a radiograph that may be so: dead ones, edges of a shield.
+_DARK = 0.02
 
 
 class Projections(Protocol):
@@ -135,6 +138,7 @@ class Scan:
             )
         pixels = np.ascontiguousarray(self.projections[start:stop], dtype=np.float32)
         if self.kind == "transmission":
+            self._warn_of_dark(pixels)
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
         if self._patches is not None:
             pixels = pixels.copy()
@@ -146,6 +150,18 @@ class Scan:
             view = start + int(np.argmin(finite))
             raise ValueError(f"{self.name}: view {view}: found a pixel that is no finite number")
         return pixels
+
+    def _warn_of_dark(self, transmission: NDArray[np.float32]) -> None:
+        dark = transmission <= _DARKEST
+        part = (dark if self.mask is None else dark & self.mask).mean(axis=(1, 2))
+        # A radiograph that is dark all over is no view of the sample, and found out elsewhere.
+        if part[part < 0.5].max(initial=0) > _DARK:
+            warnings.warn(
+                f"{self.name}: radiographs of which more than {_DARK:.0%} is dark, expected a "
+                f"transmission above {_DARKEST:g}: line integrals there are more than the "
+                f"{-np.log(_DARKEST):.3g} that they are taken as",
+                stacklevel=3,
+            )
 
     @cached_property
     def _patches(self) -> Patches | None:

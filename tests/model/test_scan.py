@@ -56,6 +56,20 @@ def test_dark_pixels_are_cut_off_at_a_millionth(geometry):
     np.testing.assert_allclose(found, np.log(1e6), atol=ROUNDING)
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_sample_too_dense_to_be_seen_through_is_told(geometry, masked):
+    transmission = np.full((VIEWS, *SHAPE), 0.5)
+    transmission[3, 1, 2] = 0.0  # one pixel of 15
+    mask = transmission[3] > 0 if masked else None
+    scan = Scan(transmission, geometry, kind="transmission", name="lead", mask=mask)
+    scan.read(0, 3)
+    if masked:
+        scan.read(0, VIEWS)
+        return
+    with pytest.warns(UserWarning, match="lead: radiographs of which more than 2% is dark"):
+        scan.read(0, VIEWS)
+
+
 def test_reading_gives_contiguous_float32(geometry, lines):
     for array in (np.asfortranarray(lines), lines.astype(np.float64), (lines * 99).astype("u2")):
         found = Scan(array, geometry).read(1, 4)
