@@ -228,11 +228,11 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
 
 
 def _unobservable(record: Record) -> str:
-    """Tell the gauge by mode, the largest first."""
+    """Tell the gauge by mode, the largest first, as far as it can be seen."""
     parts = sorted(record.gauge.items(), key=lambda mode: -mode[1])
     what = record.about.get("unobservable")
-    told = ", ".join(f"{name} {size:.2f}" for name, size in parts)
-    return f"{told} pixel rms" + (f", {what}" if what else "")
+    told = ", ".join(f"{name} {size:.2f}" for name, size in parts if size >= 0.005)
+    return f"{told or 'below 0.01'} pixel rms" + (f", {what}" if what else "")
 
 
 def _error(means: Mapping[str, float], which: str, record: Record) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import math
 import os
 import re
 import warnings
@@ -179,6 +180,10 @@ def _tiff(path: Path) -> _File:
         shape = (count, int(rows), int(columns))
         if len(series) > 1 or series[0].dataoffset is None:
             return _File(path, shape, dtype, [page for s in series for page in s.pages], tiff)
+        end = series[0].dataoffset + math.prod(shape) * dtype.itemsize
+        if (size := path.stat().st_size) < end:
+            expected = f"{end} at least: the file is cut short, copy it again"
+            raise InputError.at(path, "size", f"{size} bytes", expected)
         stored = dtype.newbyteorder(tiff.byteorder)
         frames = np.memmap(path, stored, "r", series[0].dataoffset, shape)
         tiff.close()

@@ -224,6 +224,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "raw size": ({"frames": "frames.raw", **RAW}, r"size: found 101 bytes .* a multiple of 70"),
     "raw type": ({"frames": "frames.raw", **RAW, "dtype": "grey"}, "dtype: found 'grey'"),
     "no tiff": ({"frames": "bad.tif"}, "bad.tif: cannot be read as TIFF"),
+    "cut short": ({"frames": "short.tif"}, r"short.tif: size: found .* the file is cut short"),
     "colour": ({"frames": "colour.tif"}, "colour.tif: images: found .*, expected grey frames"),
     "other size": ({"frames": ["stack.tif", "small.tif"]}, r"small.tif: frame: found \(5, 6\)"),
     "other flat": ({"flats": "small.tif"}, r"small.tif: frame: found \(5, 6\) pixels"),
@@ -240,6 +241,7 @@ def test_mistakes(
     tifffile.imwrite("colour.tif", np.zeros((4, 5, 3), np.uint8), photometric="rgb")
     Path("bad.tif").write_text("not at all")
     Path("frames.raw").write_bytes(b"x" * 101)
+    Path("short.tif").write_bytes(Path("stack.tif").read_bytes()[:600])
     Path("angles.txt").write_text("0\nten\n")
     changes, message = MISTAKES[mistake]
     arguments = {"frames": "stack.tif", "angles": "0:360:11", **SCANNER, **changes}
