@@ -101,9 +101,12 @@ def write_nxtomo(
             raise ValueError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
     if believed is None:
         believed = np.ones(geometry.views, np.bool_)
-    if believed.shape != (geometry.views,) or not believed.any():
-        found = f"shape {believed.shape} with {believed.sum()} radiographs"
-        raise ValueError(f"believed: found {found}, expected ({geometry.views},) with one or more")
+    # Of numbers, the inverse would mark the last two.
+    if believed.dtype != np.bool_ or believed.shape != (geometry.views,) or not believed.any():
+        found = f"{believed.shape} of {believed.dtype}, {believed.sum()} in all"
+        raise ValueError(
+            f"believed: found {found}, expected ({geometry.views},) of bool with one or more"
+        )
     pixels = np.dtype(dtype if dtype is not None else radiographs[0:1].dtype).newbyteorder("=")
     roles = np.concatenate([np.full(part.shape[0], role, np.int32) for role, part in parts])
     views = np.flatnonzero(roles == PROJECTION)

@@ -274,10 +274,12 @@ def test_invalid_frames_keep_geometry_and_truth_in_step(
     assert "2 frames marked invalid left out" in scan.projections.notes
 
 
-@pytest.mark.parametrize("believed", [np.ones(8, np.bool_), np.zeros(9, np.bool_)])
+@pytest.mark.parametrize("believed", [np.ones(8, np.bool_), np.zeros(9, np.bool_), np.ones(9, int)])
 def test_choices_of_views_that_are_none(tmp_path: Path, believed: np.ndarray) -> None:
     scan = Scan(np.zeros((9, 5, 6), np.float32), TRAJECTORIES["circular"])
-    with pytest.raises(ValueError, match=r"believed: found .*, expected \(9,\) with one or more"):
+    with pytest.raises(
+        ValueError, match=r"believed: found .*, expected \(9,\) of bool with one or more"
+    ):
         write_scan(tmp_path / "scan.nxs", scan, believed=believed)
     assert not list(tmp_path.iterdir())
 
