@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from clra.methods.outliers import odd, sums_of
+from clra.methods.truncation import AT_BORDER, profiles
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.helix import Helix
@@ -16,12 +16,6 @@ from clra.model.visibility import runs, views_that_see
 from clra.ops.katsevich import KatsevichFilter
 from clra.ops.pibackproject import PiBackProjector
 from clra.ops.streaming import PlaneWriter, Radiographs, Stream, Volume
-
-# Views that are looked at for a sample wider than the field of view, and the part of the largest
-# line integral, as means over rows, that may be left at the field's border. Scatter and unevenness
-# of the open beam leave one or two per cent; a sample with less than 3 beyond suffers as little.
-_PROBED, _AT_BORDER = 24, 0.03
-
 
 # Views of each helix with the helix, and the radius of the field of view [mm].
 Exact = tuple[list[tuple[slice, Helix]], float]
@@ -180,17 +174,12 @@ def _refuse_wide_sample(
     border = math.tan(helix.fan(radius))
     tangent = helix.tangent_u(np.arange(helix.shape[1]))
     rows = slice(*helix.window_rows(radius))
-    probed, sums = [], []
-    for view in np.unique(np.linspace(views.start, views.stop - 1, _PROBED).astype(int)):
-        image = radiographs.read(slice(view, view + 1))
-        probed.append(image[0, rows].mean(axis=0))
-        sums.append(sums_of(image)[:, 0])
-    profiles = np.stack(probed)[~odd(np.stack(sums, axis=1))]
     inside = np.flatnonzero(np.abs(tangent) <= border)
-    borders = profiles[:, inside[[0, -1]]].max(axis=1)
+    seen = profiles(radiographs, views, rows)[:, inside]
+    borders = seen[:, [0, -1]].max(axis=1)
     worst = int(borders.argmax())
-    cut, most = borders[worst], profiles[worst, inside].max()
-    if cut > _AT_BORDER * profiles[:, inside].max():
+    cut, most = borders[worst], seen[worst].max()
+    if cut > AT_BORDER * seen.max():
         # As wide as a round sample on the axis with the same line integrals would be.
         width = 2 * radius / math.sqrt(max(1 - (cut / most) ** 2, 1e-2))
         raise ValueError(

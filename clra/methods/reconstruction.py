@@ -14,6 +14,7 @@ from clra.methods.gaps import without_gaps
 from clra.methods.katsevich import Exact, exact_helices, katsevich
 from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
+from clra.methods.truncation import truncated
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.panel import steep_rows
@@ -171,9 +172,13 @@ def reconstruct_into(
         believed = all_but(aligned.flagged, scan.views)
     if fitted is not None:
         _warn_of_gaps(fitted, grid, scan.views if believed is None else int(believed.sum()))
+    notes = []
     if method == "fbp":
-        for note in filter(None, (part_of_a_turn(scan.geometry), steep_rows(scan.geometry))):
-            warnings.warn(note, stacklevel=2)
+        notes = [part_of_a_turn(scan.geometry), steep_rows(scan.geometry)]
+    if method != "katsevich":  # that refuses such samples
+        notes.append(truncated(Radiographs(Stream(devices[0], **limits), scan, 1)))
+    for note in filter(None, notes):
+        warnings.warn(note, stacklevel=2)
     if method in iterative.METHODS:
         stream = Stream(devices[0], report=progress, **limits)
         iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)

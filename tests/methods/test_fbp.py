@@ -110,6 +110,16 @@ def test_a_part_of_a_turn_is_warned_of():
         _in_the_middle(clra.circular(240, arc=math.radians(207), **FAN))
 
 
+@pytest.mark.parametrize("method", ["fbp", "osem-tr", "imgr"])
+def test_a_sample_wider_than_the_panel_is_warned_of(method):
+    geometry = clra.circular(60, **FAN)
+    body = Ellipsoids([(0, 0, 0)], [(14, 14, 30)], [0.1])  # the field of view's radius is 11.7
+    scan = clra.Scan(body.line_integrals(geometry), geometry)
+    with pytest.warns(UserWarning, match="beyond the panel .line integrals of 1.6"):
+        volume = clra.reconstruct(scan, method)
+    assert volume[2].max() > 1.3 * 0.1
+
+
 def test_slabs_and_chunks_change_nothing():
     scan, _ = _scan("space-filling")
     grid = VolumeGrid(shape=(61, 40, 38), voxel_size=1.5 * VOXEL, centre=(0.01, -0.02, 0.1))
@@ -160,7 +170,9 @@ def test_motion_is_absorbed():
 
 def test_a_volume_that_no_view_sees_is_zero():
     geometry = clra.circular(5, shape=(9, 9), **PANEL)
-    scan = clra.Scan(np.ones((5, 9, 9), np.float32), geometry)
+    pixels = np.zeros((5, 9, 9), np.float32)
+    pixels[:, :, 3:6] = 1
+    scan = clra.Scan(pixels, geometry)
     high = VolumeGrid(shape=(3, 4, 5), voxel_size=VOXEL, centre=(0, 0, 100.0))
     assert not clra.reconstruct(scan, grid=high).any()
 

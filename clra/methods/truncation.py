@@ -1,0 +1,61 @@
+"""Samples that are wider than what the panel sees of them, as far as radiographs tell."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.outliers import odd, sums_of
+from clra.ops.streaming import Radiographs
+
+# Views that are looked at, and the part of the largest line integral, as means over rows, that may
+# be left at a border. Scatter and unevenness of the open beam leave one or two per cent; a sample
+# with less than 3 beyond suffers as little.
+_PROBED, AT_BORDER = 24, 0.03
+# Part of the views that may show more at a border.
+_OFTEN = 0.5
+
+
+def profiles(radiographs: Radiographs, views: slice, rows: slice) -> NDArray[np.float64]:
+    """Return means over rows of a few radiographs, (n, columns).
+
+    Parameters
+    ----------
+    radiographs : Radiographs
+        Of these, any that differ much in mean or contrast say nothing and are left out.
+    views : slice
+        To choose from.
+    rows : slice
+        To average.
+    """
+    probed, sums = [], []
+    for view in np.unique(np.linspace(views.start, views.stop - 1, _PROBED).astype(int)):
+        image = radiographs.read(slice(view, view + 1))
+        probed.append(image[0, rows].mean(axis=0, dtype=np.float64))
+        sums.append(sums_of(image)[:, 0])
+    return np.stack(probed)[~odd(np.stack(sums, axis=1))]
+
+
+def truncated(radiographs: Radiographs) -> str:
+    """Say so if the sample reaches beyond the left or right border of the panel.
+
+    Parameters
+    ----------
+    radiographs : Radiographs
+        A few are read.
+
+    Returns
+    -------
+    str
+        Empty if all is well.
+    """
+    views, rows, _ = radiographs.shape
+    means = profiles(radiographs, slice(0, views), slice(0, rows))
+    # Views that moved far may well show the sample at a border.
+    cut = float(np.quantile(means[:, [0, -1]].max(axis=1), _OFTEN))
+    most = float(means.max())
+    if not cut > AT_BORDER * most:
+        return ""
+    return (
+        f"the sample reaches beyond the panel (line integrals of {cut:.3g} in its outermost "
+        f"columns, {most:.3g} inside): intensities are too high, most towards the border of the "
+        "field of view"
+    )
