@@ -12,6 +12,7 @@ References
    of tomographic projection data by passive auto-focus", Med. Phys. 38, 4934 (2011).
 """
 
+import math
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from clra.model.motion import Motion
 from clra.model.panel import with_panel
 from clra.model.scan import Scan
 from clra.model.schedule import level_name
+from clra.model.turn import covered
 from clra.model.turning import turned_back
 from clra.ops.filtering import RampFilter, taper
 from clra.ops.memory import DeviceMemoryError
@@ -107,8 +109,16 @@ def autofocus(
     Raises
     ------
     ValueError
-        If the best lies at the end of what is searched, or slices have no structure.
+        If views cover less than a turn, the best lies at the end of what is searched, or slices
+        have no structure.
     """
+    angle = covered(scan.geometry)
+    if angle < 2 * math.pi:
+        # Slices of half a turn are sharpest with a panel tilted by 3 degrees too much.
+        raise ValueError(
+            f"{scan.name}: found views over {math.degrees(angle):.0f} degrees, expected a whole "
+            "turn to find the axis and the panel's tilt by"
+        )
     limits: dict[str, Any] = {
         "max_device_memory": max_device_memory,
         "max_host_memory": max_host_memory,

@@ -1,4 +1,4 @@
-"""Circular scans whose views are not spread evenly over the turn, or cover a part of it only."""
+"""Scans whose views are not spread evenly over the turn, or cover a part of it only."""
 
 from __future__ import annotations
 
@@ -53,6 +53,18 @@ def angle_weights(geometry: ConeBeamGeometry) -> Floats:
     return weights
 
 
+def covered(geometry: ConeBeamGeometry) -> float:
+    """Return what part of the turn has views, at whatever height [rad]; a whole one is 2 pi.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of any trajectory.
+    """
+    _, gaps, step = _gaps(geometry)
+    return 2 * math.pi - float(np.sum(gaps[_hole(gaps, step)] - step))
+
+
 def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
     """Say so if ramp-filtered back-projection sees some rays of a circle twice and some once.
 
@@ -66,18 +78,17 @@ def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
     str
         Empty if all is well: no circle, a whole turn, or half a turn of a parallel beam.
     """
-    if geometry.views < 2 or not _is_circle(geometry):
+    angle = covered(geometry)
+    if geometry.views < 2 or angle == 2 * math.pi or not _is_circle(geometry):
         return ""
-    _, gaps, step = _gaps(geometry)
-    hole = _hole(gaps, step)
-    covered = 2 * math.pi - float(np.sum(gaps[hole] - step))
     width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
     parallel = 0.5 * float(np.median(width)) < _PARALLEL
-    if not hole.any() or (parallel and abs(covered - math.pi) < 2 * step):
+    step = angle / geometry.views
+    if parallel and abs(angle - math.pi) < 2 * step:
         return ""
     return (
         f"fbp counts rays that are seen from both sides twice: views cover "
-        f"{math.degrees(covered):.0f} degrees of the circle, expected "
+        f"{math.degrees(angle):.0f} degrees of the circle, expected "
         f"{'180 or ' if parallel else ''}360; intensities may be off by a fifth, less by method "
         "'osem-tr' or 'imgr'"
     )
