@@ -196,8 +196,10 @@ def _imgr(
     limits: dict[str, Any],
 ) -> "tuple[Step, ...]":
     """Reconstruct by multigrid iteration, keep what Ctrl-C leaves, or go on from there."""
+    import numpy as np
+
     from clra.app.errors import InterruptedCommandError
-    from clra.app.resuming import Leftover
+    from clra.app.resuming import Leftover, fingerprint
     from clra.io.volumes import open_volume
     from clra.methods.imgr import imgr
     from clra.methods.iterative import sorted_options
@@ -206,7 +208,14 @@ def _imgr(
     from clra.ops.streaming import Stream
 
     osem, cycle = sorted_options("imgr", options)
-    settings = {"align": align, "motion": motion is not None, **options}
+    settings = {
+        "align": align,
+        "motion": motion
+        and f"{motion.cause} " + fingerprint(motion.shift_u, motion.shift_v, motion.magnification),
+        "believed": None if believed is None else fingerprint(believed),
+        "grid": fingerprint(np.array([*grid.shape, grid.voxel_size, *grid.centre])),
+        **options,
+    }
     leftover = Leftover(out, scan, settings)
     stream = Stream(choose_devices(console.device)[0], report=progress, **limits)
     progressed = leftover.load(stream, grid) if resume else None

@@ -1,5 +1,6 @@
 """What an interrupted multigrid reconstruction leaves behind, and how it goes on."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -48,7 +49,9 @@ class Leftover:
     def __init__(self, out: str | os.PathLike[str], scan: Scan, settings: dict[str, Any]) -> None:
         self.folder = Path(out).with_name(f"{Path(out).name}.resume")
         self._scan = scan
-        self._settings = json.dumps(settings, sort_keys=True)
+        masks = [] if scan.mask is None else [scan.mask]
+        geometry = fingerprint(scan.geometry.to_astra(), *masks)
+        self._settings = json.dumps(settings | {"geometry": geometry}, sort_keys=True)
 
     def save(self, progressed: Progressed) -> None:
         """Keep what the finished levels gave.
@@ -123,6 +126,16 @@ class Leftover:
     def clear(self) -> None:
         """Remove it, if there is any."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def fingerprint(*arrays: NDArray[Any]) -> str:
+    """Return a short text that is the same for the same numbers."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(
+            f"{array.shape}{array.dtype}".encode() + np.ascontiguousarray(array).tobytes()
+        )
+    return digest.hexdigest()[:16]
 
 
 class _Planes:

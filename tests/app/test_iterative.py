@@ -8,6 +8,7 @@ import pytest
 from clra.io.scans import read_scan
 from clra.io.volumes import read_volume, write_volume
 from clra.model.grid import default_grid
+from clra.model.motion import Motion
 from clra.ops.streaming import Stream
 from tests.app.test_cli import refused
 
@@ -81,11 +82,27 @@ def test_resumed_to_the_bit(clra, scan_file, tmp_path, stopping):
     stopping(None)
     done = clra("reconstruct", scan_file, "-o", out, "--method", "imgr", "--resume")
     refused(done, 2, "motion.h5", "/@settings")
+    # The file is the same, but it is read with another geometry.
+    done = clra("reconstruct", scan_file, "-o", out, *options, "--rotation", "cw", "--resume")
+    refused(done, 2, "motion.h5", "/@settings")
     code, told, err = clra("reconstruct", scan_file, "-o", out, *options, "--resume", "--json")
     assert code == 0, err
     assert [step["level"] for step in json.loads(told)["steps"]][:2] == ["HR", "FR"]
     np.testing.assert_array_equal(read_volume(out)[0], read_volume(whole)[0])
     assert not (tmp_path / "volume.h5.resume").exists()
+
+
+def test_another_motion_is_not_gone_on_with(clra, scan_file, tmp_path, stopping):
+    out, first, second = (tmp_path / name for name in ("volume.h5", "one.h5", "two.h5"))
+    scan = read_scan(scan_file)
+    Motion.identity(scan.views).save(first)
+    Motion(shift_u=np.ones(scan.views), shift_v=np.zeros(scan.views)).save(second)
+    options = ("reconstruct", scan_file, "-o", out, "--method", "imgr", "--levels", "HR-FR")
+    stopping(1)
+    assert clra(*options, "--motion", first)[0] == 130
+    stopping(None)
+    refused(clra(*options, "--motion", second, "--resume"), 2, "motion.h5", "/@settings")
+    assert clra(*options, "--motion", first, "--resume")[0] == 0
 
 
 @pytest.mark.parametrize(
