@@ -1,5 +1,6 @@
 """Radiographs as they would have been without motion, for export and for ideal-row methods."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,13 @@ def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
     """Do as :func:`correct`, errors included, on the device and within the memory of a stream."""
     if motion.views != scan.views:
         raise ValueError(f"motion: found {motion.views} views, expected {scan.views}")
+    if motion.cause == "source":
+        warnings.warn(
+            "radiographs are resampled as if their panel had moved, but it was the source: they "
+            "are right for what lies at the depth of the axis, and what is nearer to the source or "
+            "farther keeps its parallax",
+            stacklevel=2,
+        )
     return Scan(
         _Corrected(scan, motion, stream),
         scan.geometry,

@@ -43,6 +43,9 @@ Floats = NDArray[np.float64]
 _ALIKE = 3.0
 # Fewest pairs that a smoothing spline can be fitted to.
 _FEWEST = 5
+# Part of the views, at an end of the scan, that may have no reference view beside or beyond them:
+# the smooth curve stays what it was at the last one.
+_BEYOND = 0.15
 # Points of the sample by which views are compared: twice as many find the same pairs.
 _POINTS = 40
 # Resolutions at which pairs are registered: a quarter catches drifts of 64 pixels; full resolution,
@@ -177,6 +180,13 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
         raise ValueError(
             f"{reference.name}: found {good.sum()} views that could be registered, expected "
             f"{_FEWEST} or more"
+        )
+    ends = views[good][0], views[good][-1]
+    if max(ends[0], scan.views - 1 - ends[1]) > _BEYOND * scan.views:
+        warnings.warn(
+            f"{reference.name}: found views beside {ends[0]} to {ends[1]} of {scan.name}'s 0 to "
+            f"{scan.views - 1}: beyond these the drift is not known, and taken to stay as it was",
+            stacklevel=2,
         )
     smooth = _smooth(scan.views, views[good], drift.subset(good))
     return Drift(smooth, views, replace(found, motion=drift))

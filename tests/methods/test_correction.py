@@ -56,3 +56,10 @@ def test_a_motion_of_other_length_is_refused(geometry):
     scan = clra.Scan(np.zeros((7, *SHAPE), np.float32), geometry)
     with pytest.raises(ValueError, match="motion: found 6 views, expected 7"):
         clra.correct(scan, clra.Motion.identity(6))
+
+
+def test_the_parallax_of_a_source_that_moved_stays_and_is_told(geometry, motion):
+    moved = motion.caused_by("source")
+    scan = clra.Scan(_smooth(geometry.with_motion(moved)), geometry)
+    with pytest.warns(UserWarning, match="keeps its parallax"):
+        clra.correct(scan, moved)

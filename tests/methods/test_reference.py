@@ -90,6 +90,13 @@ def test_a_bad_reference_view_and_a_place_never_seen_do_no_harm(drifted, referen
     assert u < 2 * TOLERANCE and v < 2 * TOLERANCE
 
 
+def test_a_reference_that_ends_half_way_is_told(drifted, reference, drift):
+    with pytest.warns(UserWarning, match="beside 0 to 90 of scan's 0 to 179: beyond these"):
+        found = clra.align(drifted, method="reference", reference=reference.subset(slice(0, 16)))
+    assert np.abs(found.motion.shift_v - drift.shift_v)[:90].mean() < TOLERANCE
+    assert np.abs(found.motion.shift_v - drift.shift_v)[90:].mean() > 1
+
+
 def test_what_is_no_reference_is_refused(drifted, reference, drift):
     with pytest.raises(ValueError, match="quick: found 4 views that look like one of"):
         clra.align(drifted, method="reference", reference=reference.subset(slice(0, 4)))
