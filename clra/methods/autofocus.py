@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment import align
+from clra.model.arcs import covered
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.panel import with_panel
 from clra.model.scan import Scan
 from clra.model.schedule import level_name
-from clra.model.turn import covered
 from clra.model.turning import turned_back
 from clra.ops.filtering import RampFilter, taper
 from clra.ops.memory import DeviceMemoryError

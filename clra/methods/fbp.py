@@ -8,9 +8,9 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clra.methods.outliers import handed_on
+from clra.model.arcs import angle_weights
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.turn import angle_weights
 from clra.model.visibility import runs, views_that_see
 from clra.ops.coverage import Coverage, around
 from clra.ops.filtering import FADE, RampFilter, taper

@@ -15,12 +15,12 @@ from clra.methods.katsevich import Exact, exact_helices, katsevich
 from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
 from clra.methods.truncation import truncated
+from clra.model.arcs import part_of_a_turn
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.panel import steep_rows
 from clra.model.pi_intervals import heights_between
 from clra.model.scan import Scan
-from clra.model.turn import part_of_a_turn
 from clra.ops.devices import choose_devices
 from clra.ops.streaming import HostPlanes, PlaneWriter, Radiographs, Report, Stream
 
