@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 # Chosen so that all of it ends within two minutes on two cores without a GPU.
 VIEWS, PANEL = 360, (256, 192)
-SCHEDULE = "1QR-1HR"
 _SHIFT, _MAGNIFICATION, _PHOTONS = (-10.0, 10.0), 0.002, 20000.0
 
 
@@ -62,7 +61,7 @@ def run_demo(
     *,
     views: int = VIEWS,
     panel: tuple[int, int] = PANEL,
-    schedule: str = SCHEDULE,
+    schedule: str = "auto",
     phantom: str = "porous",
     seed: int = 0,
     device: Any = None,
