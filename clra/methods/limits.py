@@ -83,9 +83,9 @@ def false_shifts(level: int, last: Floats, finer: int, first: Floats) -> str:
     name, next_name = level_name(level), level_name(finer)
     return (
         f"{next_name} moved {now} of {views} views by {least:g} pixel{'s' * (least != 1)} or more, "
-        f"the last iteration at {name} {before}: what {name} found was not their motion, features "
-        f"are too small for it or too much alike; look whether {next_name} converged, or begin "
-        f"there, such as with 4{next_name}"
+        f"the last iteration at {name} {before}: what {name} found was not their motion. Features "
+        f"are too small for it, too much alike, or move against each other (--estimate source); "
+        f"look whether {next_name} converged, or begin there, such as with 4{next_name}"
     )
 
 
