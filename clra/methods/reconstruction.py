@@ -160,10 +160,10 @@ def reconstruct_into(
         "max_device_memory": max_device_memory,
         "max_host_memory": max_host_memory,
     }
+    stream = Stream(devices[0], report=progress, **limits)
     fitted: Exact | None = None
     if method == "katsevich":
         # What it cannot treat it refuses before the long work.
-        stream = Stream(devices[0], **limits)
         whole = without_gaps(scan, believed)
         fitted = exact_helices(Radiographs(stream, whole, 1), whole.geometry, grid)
     if align and method != "imgr":
@@ -176,11 +176,10 @@ def reconstruct_into(
     if method == "fbp":
         notes = [part_of_a_turn(scan.geometry), steep_rows(scan.geometry)]
     if method != "katsevich":  # that refuses such samples
-        notes.append(truncated(Radiographs(Stream(devices[0], **limits), scan, 1)))
+        notes.append(truncated(Radiographs(stream, scan, 1)))
     for note in filter(None, notes):
         warnings.warn(note, stacklevel=2)
     if method in iterative.METHODS:
-        stream = Stream(devices[0], report=progress, **limits)
         iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)
         return
 
@@ -205,7 +204,6 @@ def reconstruct_into(
             )
 
     if len(devices) == 1:
-        stream = Stream(devices[0], report=progress, **limits)
         work(stream, slice(0, grid.shape[0]), target)
     else:
         on_devices(devices, work, grid.shape[0], target, progress=progress, **limits)

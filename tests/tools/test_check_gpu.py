@@ -1,11 +1,6 @@
-import importlib
-from pathlib import Path
-
 import pytest
 
 from clra import kernels
-
-_TOOLS = Path(__file__).parents[2] / "tools"
 
 PTXAS = """\
 ptxas info    : 0 bytes gmem
@@ -21,15 +16,13 @@ ptxas info    : Used 19 registers, used 0 barriers, 408 bytes cmem[0]
 
 
 @pytest.fixture
-def check_gpu(monkeypatch):
-    monkeypatch.syspath_prepend(str(_TOOLS))
-    return importlib.import_module("check_gpu")
+def check_gpu(tool):
+    return tool("check_gpu")
 
 
 @pytest.fixture
-def gpu_usage(monkeypatch):
-    monkeypatch.syspath_prepend(str(_TOOLS))
-    return importlib.import_module("gpu_usage")
+def gpu_usage(tool):
+    return tool("gpu_usage")
 
 
 def test_every_kernel_file_has_its_forms(check_gpu):

@@ -1,6 +1,3 @@
-import importlib
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -8,14 +5,12 @@ import clra
 from clra.model.perturbation import random_motion
 from clra.model.phantom import Ellipsoids
 
-_TOOLS = Path(__file__).parents[2] / "tools"
 BALL = Ellipsoids([[0.1, -0.2, 0.05]], [0.45], [1.0])
 
 
 @pytest.fixture
-def rock(monkeypatch):
-    monkeypatch.syspath_prepend(str(_TOOLS))
-    return importlib.import_module("rock")
+def rock(tool):
+    return tool("rock")
 
 
 @pytest.fixture
