@@ -15,6 +15,7 @@ from clra.io.nxgeometry import Fields, fields_of, top_down
 from clra.io.nxtomo import DARK, FLAT, INVALID, PROJECTION
 from clra.io.reporting import Report, tell
 from clra.io.slabs import SlabWriter, reserve
+from clra.model.checks import believed_views
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Projections
@@ -101,12 +102,7 @@ def write_nxtomo(
             raise ValueError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
     if believed is None:
         believed = np.ones(geometry.views, np.bool_)
-    # Of numbers, the inverse would mark the last two.
-    if believed.dtype != np.bool_ or believed.shape != (geometry.views,) or not believed.any():
-        found = f"{believed.shape} of {believed.dtype}, {believed.sum()} in all"
-        raise ValueError(
-            f"believed: found {found}, expected ({geometry.views},) of bool with one or more"
-        )
+    believed = believed_views(believed, geometry.views)
     pixels = np.dtype(dtype if dtype is not None else radiographs[0:1].dtype).newbyteorder("=")
     roles = np.concatenate([np.full(part.shape[0], role, np.int32) for role, part in parts])
     views = np.flatnonzero(roles == PROJECTION)

@@ -16,6 +16,7 @@ from clra.methods.outliers import all_but
 from clra.methods.sharing import on_devices
 from clra.methods.truncation import truncated
 from clra.model.arcs import part_of_a_turn
+from clra.model.checks import believed_views
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.panel import steep_rows
@@ -144,13 +145,7 @@ def reconstruct_into(
     if align and motion is not None:
         raise ValueError("motion and align: found both, expected one of them")
     if believed is not None:
-        believed = np.asarray(believed)
-        # Numbers would choose views 0 and 1.
-        if believed.dtype != np.bool_ or believed.shape != (scan.views,) or not believed.any():
-            raise ValueError(
-                f"believed: found {believed.shape} of {believed.dtype}, {believed.sum()} in all, "
-                f"expected ({scan.views},) of bool with at least one view"
-            )
+        believed = believed_views(believed, scan.views)
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
     motion = None if motion is None else motion.about(*scan.window_aside)
     scan = scan.cropped()

@@ -82,6 +82,20 @@ def column(name: str, value: ArrayLike, each: str) -> Floats:
     return _finite_array(name, array, each)
 
 
+def believed_views(believed: ArrayLike, views: int) -> NDArray[np.bool_]:
+    """Check which views are believed: one value each, at least one of them true.
+
+    Only bool will do: as an index, numbers would choose views 0 and 1.
+    """
+    array = np.asarray(believed)
+    if array.dtype != np.bool_ or array.shape != (views,) or not array.any():
+        raise ValueError(
+            f"believed: found {array.shape} of {array.dtype}, {array.sum()} in all, "
+            f"expected ({views},) of bool with one or more"
+        )
+    return array
+
+
 def _finite_array(name: str, array: Floats, each: str) -> Floats:
     bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
     if bad.any():
