@@ -181,7 +181,7 @@ def run(name: str, one: Run, folder: Path) -> tuple[str, str]:
 
 
 _DEVICE = """
-from clra.ops.devices import choose_device
+from clra.ops.runtime.devices import choose_device
 device = choose_device()
 print(device.name.strip(), "of", device.platform.name, device.platform.version)
 """

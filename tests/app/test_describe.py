@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from clra.app.describe import Facts, metric, path_of
+from clra.app.scan_description import Facts, metric, path_of
 from clra.model import trajectory
 from clra.model.motion import Motion
 from clra.model.scan import Scan

@@ -4,11 +4,11 @@ import warnings
 import pyopencl as cl
 import pytest
 
-from clra.app.errors import InterruptedCommandError, _plain_warnings, verdict
-from clra.io.errors import InputError, OutputError
-from clra.ops.devices import NoDeviceError
-from clra.ops.memory import DeviceMemoryError
-from clra.ops.opencl import KernelBuildError
+from clra.app.exit_status import InterruptedCommandError, _plain_warnings, verdict
+from clra.errors import InputError, OutputError
+from clra.ops.runtime.build import KernelBuildError
+from clra.ops.runtime.devices import NoDeviceError
+from clra.ops.streaming.memory import DeviceMemoryError
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clra.app.estimate import costs_of, costs_table, size
-from clra.app.simulate import paper_like
+from clra.app.cost import costs_of, costs_table, size
+from clra.app.simulation import paper_like
 from clra.app.speed import Speed, measure
 from clra.model.grid import default_grid
 from clra.model.trajectory import double_helix
-from clra.ops.devices import choose_device
-from clra.ops.memory import Budgets
+from clra.ops.runtime.devices import choose_device
+from clra.ops.streaming.memory import Budgets
 
 SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
 

@@ -2,8 +2,8 @@ import io
 
 import pytest
 
-from clra.app.progress import Lines, duration, shown
-from clra.ops.streaming import Progress
+from clra.app.progress_bar import Lines, duration, shown
+from clra.ops.streaming.stream import Progress
 
 
 @pytest.mark.parametrize(

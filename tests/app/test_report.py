@@ -5,12 +5,12 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from clra.app.comparison import Comparison, Match, Pair
-from clra.app.describe import Facts
-from clra.app.findings import Errors, Findings, summary_of
 from clra.app.records import Record
-from clra.app.report import render, write_report
-from clra.methods.quality import Quality
+from clra.app.report.comparison import Comparison, Match, Pair
+from clra.app.report.html_report import render, write_report
+from clra.app.report.summary import Errors, Findings, summary_of
+from clra.app.scan_description import Facts
+from clra.methods.alignment.quality import Quality
 from clra.model.motion import Motion
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from clra.app.simulate import (
+from clra.app.simulation import (
     MOTIONS,
     PHANTOMS,
     TRAJECTORIES,
@@ -11,7 +11,7 @@ from clra.app.simulate import (
     simulated_scan,
 )
 from clra.model import trajectory
-from clra.model.gauge import Gauge, sample_points
+from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 

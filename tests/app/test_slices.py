@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.slices import Slicer
+from clra.app.report.slices import Slicer
 from clra.model.grid import VolumeGrid
-from clra.model.phantom import Ellipsoids
-from clra.ops.streaming import Stream
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.ops.streaming.stream import Stream
 
 PANEL = {"source_to_axis": 3.0, "source_to_detector": 6.0, "pixel_size": 0.034, "shape": (77, 133)}
 BODY = Ellipsoids(

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from clra.io.errors import InputError
-from clra.io.frames import import_frames
-from clra.io.scans import read_scan
-from clra.io.stacks import warn_of_gaps
+from clra.errors import InputError
+from clra.io.frames.frame_import import import_frames
+from clra.io.frames.stacks import warn_of_gaps
+from clra.io.scan_files import read_scan
 
 VIEWS, ROWS, COLUMNS = 11, 5, 7
 SCANNER = {"source_distance": 30.0, "detector_distance": 270.0, "pixel_size": 0.5}

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from geometries import upside_down
 
-from clra.io.errors import InputError
-from clra.io.geometries import read_rtk_geometry, write_rtk_geometry
+from clra.errors import InputError
+from clra.io.motion_formats.rtk import read_rtk_geometry, write_rtk_geometry
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.trajectory import helix
 

@@ -5,8 +5,8 @@ import h5py
 import numpy as np
 import pytest
 
-from clra.io.errors import InputError
-from clra.io.motions import read_motion_file, write_motion_file
+from clra.errors import InputError
+from clra.io.motion_file import read_motion_file, write_motion_file
 from clra.model.motion import Motion
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from geometries import upside_down
 
-from clra.io.nxgeometry import far_source_distance, fields_of
-from clra.io.nxtomo_writing import write_nxtomo
-from clra.io.scans import read_scan, write_scan
+from clra.io.nxtomo.geometry_fields import far_source_distance, fields_of
+from clra.io.nxtomo.writer import write_nxtomo
+from clra.io.scan_files import read_scan, write_scan
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -295,7 +295,7 @@ def test_chunks_do_not_matter(nxtomo_file: Builder, tmp_path: Path) -> None:
 
 
 def test_progress_and_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clra.io.nxtomo_writing._PIECE", 2 * 5 * 6 * 4)
+    monkeypatch.setattr("clra.io.nxtomo.writer._PIECE", 2 * 5 * 6 * 4)
     told = []
     pixels = np.random.default_rng(4).random((9, 5, 6), np.float32)
     path = tmp_path / "scan.nxs"

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clra.io.nxtomo_writing import write_nxtomo
-from clra.io.scans import read_scan
+from clra.io.nxtomo.writer import write_nxtomo
+from clra.io.scan_files import read_scan
 from clra.model.trajectory import helix
 
 pytest.importorskip("nxtomo")

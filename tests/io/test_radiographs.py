@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from clra.io.errors import InputError
-from clra.io.radiographs import Radiographs
+from clra.errors import InputError
+from clra.io.frames.counts import Radiographs
 
 NONE = np.array([], np.intp)
 

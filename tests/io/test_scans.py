@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
-from clra.io.errors import InputError
-from clra.io.scans import read_scan, scan_checksum
+from clra.errors import InputError
+from clra.io.scan_files import read_scan, scan_checksum
 from clra.model.scan import Scan
 from clra.model.trajectory import circular
 

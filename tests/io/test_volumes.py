@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from clra.io import tiff_volumes
-from clra.io.errors import InputError, OutputError
-from clra.io.volumes import open_volume, read_volume, write_volume
+from clra.errors import InputError, OutputError
+from clra.io.volumes import tiff
+from clra.io.volumes.volume_files import open_volume, read_volume, write_volume
 from clra.model.grid import VolumeGrid
 
 GRID = VolumeGrid(shape=(5, 7, 9), voxel_size=0.0123456789, centre=(0.5, -1.25, 1 / 3))
@@ -21,7 +21,7 @@ def volume() -> np.ndarray:
 @pytest.fixture(params=["vol.h5", "vol.tif", "big.tif"])
 def path(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     if request.param == "big.tif":
-        monkeypatch.setattr(tiff_volumes, "_PLAIN_TIFF", 0)
+        monkeypatch.setattr(tiff, "_PLAIN_TIFF", 0)
     return tmp_path / request.param
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import counted
-from clra.methods.alignment import AlignmentInterrupted
-from clra.model.gauge import Gauge, sample_points, without_gauge
+from clra.app.simulation import counted
+from clra.methods.alignment.align import AlignmentInterrupted
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.model.phantom import porous
+from clra.model.phantoms.ellipsoids import porous
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 
 # The paper's simulation at a quarter of its resolution, cut to a third of its height.
 VIEWS, SHAPE = 180, (128, 128)

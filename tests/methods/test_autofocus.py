@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import paper_like, sample, simulated_motion
-from clra.methods.autofocus import Focus, autofocus, sharpening_by_turning_back
-from clra.model.gauge import Gauge, sample_points
+from clra.app.simulation import paper_like, sample, simulated_motion
+from clra.methods.alignment.autofocus import Focus, autofocus, sharpening_by_turning_back
+from clra.model.detector_pose import with_panel
+from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
-from clra.model.panel import with_panel
-from clra.model.turning import turned_back
+from clra.model.rotation_sense import turned_back
 
 OFFSET, TILT = 6.0, math.radians(1.0)
 VIEWS, SHAPE = 90, (64, 64)

@@ -7,10 +7,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import clra
-from clra.methods.fbp import ramp_fbp
+from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid, default_grid
-from clra.model.phantom import Ellipsoids, three_spheres
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
+from clra.ops.streaming.stream import Radiographs, Stream
 
 # The paper's simulation at an eighth of its resolution, all lengths as there.
 VIEWS, SHAPE, PIXEL = 432, (116, 64), 0.4544 * 8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clra
-from clra.methods.gaps import without_gaps
+from clra.methods.reconstruction.missing_views import without_gaps
 
 PANEL = {
     "source_to_axis": 30.0,

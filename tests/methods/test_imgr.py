@@ -5,18 +5,18 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import clra
-from clra.methods.imgr import imgr
-from clra.methods.multigrid import ReconstructionInterrupted
-from clra.methods.osem_tr import OrderedSubsets
-from clra.methods.residuals import between, residuals
-from clra.model.gauge import sample_points, without_gauge
+from clra.methods.reconstruction.imgr import imgr
+from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.methods.reconstruction.osem_tr import OrderedSubsets
+from clra.methods.reconstruction.residuals import between, residuals
+from clra.model.gauge.gauge import sample_points, without_gauge
 from clra.model.grid import default_grid
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.model.phantom import porous
-from clra.model.visibility import sampled
-from clra.ops.memory import Store
-from clra.ops.slabs import SlabProjector, volume_from
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.phantoms.ellipsoids import porous
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
+from clra.model.view_selection import sampled
+from clra.ops.streaming.memory import Store
+from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.volume_slabs import SlabProjector, volume_from
 
 # The scan of the paper's section 3.2 at a twenty-fourth of its resolution.
 VIEWS, COLUMNS = 160, 96
@@ -127,7 +127,7 @@ def test_noise_and_few_views_are_taken_better_than_by_filtered_back_projection(s
 
 
 def test_an_interrupted_run_goes_on_as_if_it_had_not_been(scan, grid, stream, monkeypatch):
-    monkeypatch.setattr("clra.methods.imgr.converged", lambda *updates: False)
+    monkeypatch.setattr("clra.methods.reconstruction.imgr.converged", lambda *updates: False)
 
     def run(reports, progressed=None):
         count = [0]

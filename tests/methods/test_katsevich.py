@@ -8,13 +8,13 @@ import pytest
 from scipy import ndimage
 
 import clra
-from clra.io.scans import write_scan
-from clra.methods.katsevich import katsevich
+from clra.io.scan_files import write_scan
+from clra.methods.reconstruction.katsevich import katsevich
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.helix_fit import fit_helices
-from clra.model.phantom import Ellipsoids, three_spheres
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.helix.fit import fit_helices
+from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
+from clra.ops.streaming.stream import Radiographs, Stream
 
 MEAN, RMS = 1e-3, 6e-3  # of the phantom's 1/mm, in flat regions
 BETTER = 5  # times smaller rms than ramp-FBP's

@@ -10,7 +10,7 @@ import pytest
 
 import clra
 from clra.model.grid import default_grid
-from clra.model.phantom import porous
+from clra.model.phantoms.ellipsoids import porous
 
 SAME = 1e-4  # of the largest attenuation
 

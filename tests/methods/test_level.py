@@ -7,14 +7,14 @@ import pyopencl.array as cl_array
 import pytest
 
 import clra
-from clra.methods.level import Level, reprojections
-from clra.methods.solver import Solver
+from clra.methods.alignment.level import Level, reprojections
+from clra.methods.alignment.options import Solver
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
-from clra.model.phantom import Ellipsoids
-from clra.ops.projector import ForwardProjector
-from clra.ops.slabs import volume_from
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.ops.projection.projector import ForwardProjector
+from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.volume_slabs import volume_from
 
 VIEWS = 121
 SAME = 1e-5  # of the largest magnitude

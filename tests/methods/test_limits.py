@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import counted, paper_like, sample, simulated_motion
-from clra.methods.level import Level
-from clra.methods.limits import (
+from clra.app.simulation import counted, paper_like, sample, simulated_motion
+from clra.methods.alignment.level import Level
+from clra.methods.alignment.limits import (
     false_shifts,
     far_motion,
     lost_features,
     surviving_contrast,
     warned,
 )
-from clra.methods.reprojection import Registered
+from clra.methods.alignment.reprojection import Registered
 from clra.model.grid import default_grid
-from clra.model.phantom import Ellipsoids
+from clra.model.phantoms.ellipsoids import Ellipsoids
 
 
 def test_noise_is_lost_and_structure_is_not():

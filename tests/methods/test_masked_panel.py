@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import paper_like, sample, simulated_motion
+from clra.app.simulation import paper_like, sample, simulated_motion
 
 VIEWS, SHAPE = 120, (96, 96)
 TOP, LEFT, PANEL = 7, 20, (110, 128)

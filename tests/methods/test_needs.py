@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import paper_like
-from clra.methods import alignment
-from clra.methods.fbp import ramp_fbp
-from clra.methods.imgr import imgr
-from clra.methods.needs import alignment_need, multigrid_need, reconstruction_need
+from clra.app.simulation import paper_like
+from clra.methods.alignment import align
+from clra.methods.memory_estimate import alignment_need, multigrid_need, reconstruction_need
+from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.reconstruction.imgr import imgr
 from clra.model.grid import default_grid
-from clra.ops.streaming import HostPlanes, Radiographs, Stream
+from clra.ops.streaming.stream import HostPlanes, Radiographs, Stream
 
 MIB = 1 << 20
 AGREES = 0.2  # part by which prediction and measurement may differ
@@ -52,7 +52,7 @@ def test_alignment_takes_what_is_predicted(panel, level, budget, monkeypatch):
         streams.append(Stream(*arguments, **options))
         return streams[-1]
 
-    monkeypatch.setattr(alignment, "Stream", remembered)
+    monkeypatch.setattr(align, "Stream", remembered)
     schedule = {1: "1FR", 2: "1HR"}[level]
     clra.align(scan, schedule=schedule, max_device_memory=budget)
     need = alignment_need(streams[0].budgets, scan.geometry, default_grid(scan.geometry), level)

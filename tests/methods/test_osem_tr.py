@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import clra
-from clra.methods.osem_tr import OrderedSubsets, osem_tr, start_volume
+from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
 from clra.model.grid import default_grid
-from clra.model.phantom import porous
-from clra.ops.slabs import SlabProjector, volume_from
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.phantoms.ellipsoids import porous
+from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.volume_slabs import SlabProjector, volume_from
 
 PHOTONS = 1e4
 # 4 x 7 x 7 voxels under 120 views of 10 x 20: small and well posed enough to converge.

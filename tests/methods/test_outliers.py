@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 import clra
-from clra.methods.outliers import from_neighbours, handed_on, odd_radiographs, outliers
-from clra.ops.streaming import Radiographs, Stream
+from clra.methods.alignment.rejected_views import (
+    from_neighbours,
+    handed_on,
+    odd_radiographs,
+    outliers,
+)
+from clra.ops.streaming.stream import Radiographs, Stream
 
 
 def test_views_far_below_the_others_are_found():

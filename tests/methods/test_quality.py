@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import paper_like, sample, simulated_motion, simulated_scan
-from clra.methods.quality import quality
-from clra.ops.streaming import Stream
+from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
+from clra.methods.alignment.quality import quality
+from clra.ops.streaming.stream import Stream
 
 VIEWS, SHAPE = 120, (96, 96)
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 import clra
-from clra.io.frames import import_frames
+from clra.io.frames.frame_import import import_frames
 from clra.model.grid import default_grid
 
 SHIFT = 6.0  # pixel, either way

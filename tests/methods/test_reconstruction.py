@@ -8,7 +8,7 @@ import pytest
 
 import clra
 from clra.model.grid import default_grid
-from clra.model.phantom import Ellipsoids
+from clra.model.phantoms.ellipsoids import Ellipsoids
 
 BODY = Ellipsoids([[0, 0, 0], [0.2, 0.1, 0]], [[0.6, 0.6, 0.5], [0.1, 0.2, 0.1]], [1.0, 0.5])
 BELIEVED = np.arange(121) % 40 != 7

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulate import paper_like, sample
-from clra.model.perturbation import random_motion, smooth_motion
+from clra.app.simulation import paper_like, sample
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 
 VIEWS, SHAPE, EVERY = 180, (112, 128), 6
 # Mean absolute errors [pixel]: pairs of 112 x 128 are registered to 0.01, the curve between them

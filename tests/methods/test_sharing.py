@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import clra
-from clra.methods.sharing import on_devices
-from clra.ops.devices import NoDeviceError, choose_device
+from clra.methods.execution.several_devices import on_devices
+from clra.ops.runtime.devices import NoDeviceError, choose_device
 
 TWICE = """
 import sys
 import numpy as np
 import clra
-from clra.app.simulate import paper_like, sample, simulated_scan
-from clra.methods import sharing
-from clra.ops.devices import choose_devices
+from clra.app.simulation import paper_like, sample, simulated_scan
+from clra.methods.execution import several_devices
+from clra.ops.runtime.devices import choose_devices
 
 devices = choose_devices("all")
 if len(devices) < 2:
@@ -27,7 +27,7 @@ geometry = paper_like("helix", 320, (64, 64))
 truth = clra.Motion.identity(320)
 scan = simulated_scan(geometry, sample("spheres", geometry), truth, name="shared")
 worked = set()
-run = sharing._Worker.run
+run = several_devices._Worker.run
 
 
 def watched(self, *rest):
@@ -35,7 +35,7 @@ def watched(self, *rest):
     run(self, *rest)
 
 
-sharing._Worker.run = watched
+several_devices._Worker.run = watched
 for method in ("fbp", "katsevich"):
     progress = []
     shared = clra.reconstruct(scan, method, device="all", progress=progress.append)

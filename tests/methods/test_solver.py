@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import clra
-from clra.methods import fbp
-from clra.methods.solver import Solver
-from clra.model.gauge import Gauge, sample_points, without_gauge
+from clra.methods.alignment.options import Solver
+from clra.methods.reconstruction import fbp
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.model.phantom import porous
+from clra.model.phantoms.ellipsoids import porous
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 
 # The paper's helix at a quarter of its resolution and a 32nd of its views.
 VIEWS, SCALE = 108, 4

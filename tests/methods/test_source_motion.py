@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.gauge import sample_points, without_gauge
+from clra.model.gauge.gauge import sample_points, without_gauge
 from clra.model.grid import default_grid
-from clra.model.perturbation import smooth_motion
-from clra.model.phantom import porous
+from clra.model.phantoms.ellipsoids import porous
+from clra.model.phantoms.perturbation import smooth_motion
 
 # Fan 67 degrees: half of a lateral shift differs across the depth of the sample.
 VIEWS, SHAPE = 120, (96, 96)

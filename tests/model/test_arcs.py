@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.arcs import angle_weights, part_of_a_turn
+from clra.model.angular_coverage import angle_weights, part_of_a_turn
 from clra.model.trajectory import circular, helix
 
 PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 0.5, "shape": (7, 96)}

@@ -6,12 +6,12 @@ import time
 import numpy as np
 import pytest
 
-from clra.model.gauge import Gauge, sample_points, without_gauge
-from clra.model.gauge_modes import GAUGE_MODES, gauge_columns
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
+from clra.model.gauge.modes import GAUGE_MODES, gauge_columns
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
-from clra.model.perturbation import random_motion, smooth_motion
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 from clra.model.trajectory import PAPER, circular, helix, space_filling
 
 # Finite differences of 1e-6 of the sample's size, in float64.
@@ -98,7 +98,7 @@ def test_columns_of_panels_in_general_position(points):
 
 def test_columns_do_not_depend_on_chunks_of_views(scan, points, monkeypatch):
     whole = gauge_columns(scan, points)
-    monkeypatch.setattr("clra.model.gauge_modes._CHUNK", 1)
+    monkeypatch.setattr("clra.model.gauge.modes._CHUNK", 1)
     np.testing.assert_allclose(gauge_columns(scan, points), whole, atol=ROUNDING)
 
 

@@ -8,9 +8,9 @@ import pytest
 import clra
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.helix import Helix
-from clra.model.helix_fit import fit_helices
-from clra.model.pi_intervals import field_of_view, pi_reach, pi_spans
+from clra.model.helix.fit import fit_helices
+from clra.model.helix.helix import Helix
+from clra.model.helix.pi_intervals import field_of_view, pi_reach, pi_spans
 
 PIXELS = 1e-9
 PANEL = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.helix_gaps import completed
+from clra.model.helix.gaps import completed
 
 PANEL = {
     "source_to_axis": 30.0,

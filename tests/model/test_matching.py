@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from clra.model.gauge import sample_points
+from clra.model.gauge.gauge import sample_points
 from clra.model.grid import default_grid
-from clra.model.matching import match_views
 from clra.model.trajectory import circular, helix
+from clra.model.view_matching import match_views
 
 STAGE = {"source_to_axis": 4.3627, "source_to_detector": 436.27, "pixel_size": 3.6}
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from clra.model.detector_pose import with_panel
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.panel import with_panel
 from clra.model.trajectory import helix
 
 STAGE = {"source_to_axis": 4.3627, "source_to_detector": 436.27, "shape": (61, 67)}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clra.model.perturbation import random_motion, smooth_motion
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 
 BOTH = pytest.mark.parametrize("make", [random_motion, smooth_motion])
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.phantom import Ellipsoids, porous, three_spheres
+from clra.model.phantoms.ellipsoids import Ellipsoids, porous, three_spheres
 from clra.model.trajectory import PAPER, circular
 
 # float32 rounding of line integrals of a few.

@@ -3,8 +3,8 @@
 import numpy as np
 
 import clra
-from clra.model.panel import with_panel
-from clra.model.turning import turned_back
+from clra.model.detector_pose import with_panel
+from clra.model.rotation_sense import turned_back
 
 
 def _helix(angle_step: float) -> clra.ConeBeamGeometry:

@@ -4,7 +4,7 @@ import numpy as np
 
 import clra
 from clra.model.grid import VolumeGrid
-from clra.model.visibility import runs, views_that_see
+from clra.model.view_selection import runs, views_that_see
 
 PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clra.model.grid import VolumeGrid
-from clra.model.wood import wood
+from clra.model.phantoms.wood import wood
 
 RADIUS, HEIGHT = 1.45, 3.0
 

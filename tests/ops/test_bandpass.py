@@ -6,8 +6,8 @@ import pyopencl.array as cl_array
 import pytest
 from scipy import ndimage
 
-from clra.ops import bandpass
-from clra.ops.bandpass import Bandpass
+from clra.ops.images import bandpass
+from clra.ops.images.bandpass import Bandpass
 
 ROUNDING = 3e-6  # of images of values around 1
 GAUSSIAN = 0.01  # of the filtered image's largest value: splines and cut-off taps for Gaussians

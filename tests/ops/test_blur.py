@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from clra.ops import lines
-from clra.ops.blur import Blur, gaussian_taps
-from clra.ops.lines import MARGIN, line_stride, lined
-from clra.ops.steps import to_device
+from clra.ops.images.blur import Blur, gaussian_taps
+from clra.ops.runtime import lines
+from clra.ops.runtime.kernel import to_device
+from clra.ops.runtime.lines import MARGIN, line_stride, lined
 
 ROUNDING = 2e-6  # of values around 1
 
@@ -13,7 +13,7 @@ ROUNDING = 2e-6  # of values around 1
 @pytest.mark.parametrize("lanes", [8, 2])
 @pytest.mark.parametrize(("shape", "sigma"), [((23, 37), 2.0), ((40, 16), 3.5), ((5, 70), 0.7)])
 def test_is_the_mean_of_what_lies_on_the_panel(context, queue, monkeypatch, shape, sigma, lanes):
-    monkeypatch.setattr("clra.ops.blur.lanes", lambda context: lanes)
+    monkeypatch.setattr("clra.ops.images.blur.lanes", lambda context: lanes)
     images = np.random.default_rng(0).normal(size=(2, *shape))
     image = to_device(context, np.stack([lined(i) for i in images]))
     blank = np.zeros((2, shape[0], line_stride(shape[1])))

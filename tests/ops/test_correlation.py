@@ -6,10 +6,10 @@ import pyopencl.array as cl_array
 import pytest
 from scipy import ndimage
 
-from clra.ops import opencl
-from clra.ops.bandpass import Bandpass
-from clra.ops.correlation import CoarseShift, PhaseCorrelation
-from clra.ops.windows import registration_window, tukey
+from clra.ops.images.bandpass import Bandpass
+from clra.ops.registration.phase_correlation import CoarseShift, PhaseCorrelation
+from clra.ops.registration.windows import registration_window, tukey
+from clra.ops.runtime import build
 
 SAME = 2e-3  # pixels, against the same steps in float64
 BIAS = 0.2  # pixels: a parabola through a peak that is none, and a window that stands still
@@ -63,7 +63,7 @@ def reference(measured, simulated) -> np.ndarray:
 @pytest.mark.parametrize("group", [1, 8])
 @pytest.mark.parametrize("shape", [(64, 80), (90, 45), (75, 81)])
 def test_is_the_papers_estimator(context, queue, monkeypatch, shape, group):
-    monkeypatch.setattr("clra.ops.correlation.group", lambda *_: group)
+    monkeypatch.setattr("clra.ops.registration.phase_correlation.group", lambda *_: group)
     images = noise(shape)
     truth = np.random.default_rng(1).uniform(-6, 6, (4, 2))
     measured = 0.3 + shifted(images, truth)
@@ -177,7 +177,7 @@ def test_bad_arrays_are_refused(context, queue):
         operator(queue, out, cl_array.zeros(queue, (2, 80, 64), np.float32), good)
     with pytest.raises(ValueError, match="shifts_out: found shape"):
         operator(queue, out[:1], good, good)
-    other = cl.Context([opencl.device_of(context)])
+    other = cl.Context([build.device_of(context)])
     foreign = cl_array.zeros(cl.CommandQueue(other), (2, 64, 80), np.float32)
     with pytest.raises(ValueError, match="simulated: its context"):
         operator(queue, out, good, foreign)

@@ -9,7 +9,7 @@ import pytest
 
 import clra
 from clra.model.grid import VolumeGrid, field_radii
-from clra.ops.coverage import Coverage
+from clra.ops.projection.coverage import Coverage
 
 PANEL = {"source_to_axis": 60.0, "source_to_detector": 100.0, "pixel_size": 1.0, "shape": (38, 45)}
 # Of the largest W: what linear interpolation between coarse voxels costs.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pyopencl as cl
 import pytest
 
-from clra.ops import devices
+from clra.ops.runtime import devices
 
 
 def test_devices_are_listed_and_can_be_chosen_by_what_is_listed(context):

@@ -4,8 +4,8 @@ import pyopencl.array as cl_array
 import pytest
 from arrays import with_offset
 
-from clra.ops import opencl
-from clra.ops.fft import BACKENDS, RealFFT, fast_length
+from clra.ops.filtering.fft import BACKENDS, RealFFT, fast_length
+from clra.ops.runtime import build
 
 RELATIVE = 1e-6  # of the largest magnitude
 SHAPES = [((3, 5, 8), (2,)), ((2, 4, 8), (1, 2)), ((2, 3, 9), (2,)), ((2, 5, 6), (1, 2))]
@@ -15,7 +15,7 @@ DEGENERATE = [((2, 1, 8), (1, 2)), ((3, 4, 1), (2,)), ((1, 3, 2), (1, 2))]
 @pytest.fixture(scope="module", autouse=True)
 def compiler(context: cl.Context) -> None:
     """Builds once, so that a PoCL device that needs mending is mended before reikna compiles."""
-    opencl.builds(context).program("fft.cl")
+    build.builds(context).program("fft.cl")
 
 
 def image_of(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:

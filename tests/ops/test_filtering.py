@@ -6,8 +6,8 @@ import pytest
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.trajectory import circular
-from clra.ops import filtering
-from clra.ops.filtering import RampFilter, taper
+from clra.ops.filtering import ramp as ramp_module
+from clra.ops.filtering.ramp import RampFilter, taper
 
 RELATIVE = 2e-6  # of the largest magnitude: float32 transforms
 ALIASING = 5e-4  # of kernels that go on beyond the padded line
@@ -99,7 +99,7 @@ def test_filter_is_the_direct_convolution(context, queue, shape):
     assert_close(found, filtered(geometry, weighted, row_weight))
 
 
-@pytest.mark.parametrize("window", filtering.WINDOWS)
+@pytest.mark.parametrize("window", ramp_module.WINDOWS)
 def test_windows_shape_the_ramp(context, queue, window):
     geometry = scanner(shape=(3, 41))
     image = image_of(geometry)
@@ -163,8 +163,8 @@ def test_any_chunk_gives_the_same(context, queue, monkeypatch):
     geometry = scanner(views=5)
     image = image_of(geometry)
     expected = run(context, queue, geometry, image)
-    monkeypatch.setattr(filtering, "_CPU_BYTES", 4 * 27 * 3)  # 3 lines at a time
-    monkeypatch.setattr(filtering, "_GPU_BYTES", 4 * 32 * 3)
+    monkeypatch.setattr(ramp_module, "_CPU_BYTES", 4 * 27 * 3)  # 3 lines at a time
+    monkeypatch.setattr(ramp_module, "_GPU_BYTES", 4 * 32 * 3)
     ramp_filter = RampFilter(context, geometry)
     whole = cl_array.to_device(queue, image)
     for start, stop in [(1, 2), (0, 1), (2, 5)]:

@@ -8,9 +8,9 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 import pytest
 
-from clra.model.helix import Helix
-from clra.ops import katsevich
-from clra.ops.katsevich import KatsevichFilter
+from clra.model.helix.helix import Helix
+from clra.ops.filtering import katsevich_filter
+from clra.ops.filtering.katsevich_filter import KatsevichFilter
 
 RELATIVE = 2e-5  # of the largest magnitude: float32, and tabulated inverses
 RADIUS = 4.0
@@ -64,7 +64,7 @@ def filtered(helix: Helix, image: np.ndarray) -> np.ndarray:
     up = mean(mean(np.diff(p, axis=1), 0), 2) / (helix.pitch_v / scale)
     derivative = (along + (1 + u**2) * across + u * v * up) / np.sqrt(1 + u**2 + v**2)
 
-    psi = katsevich._angles(helix, RADIUS)
+    psi = katsevich_filter._angles(helix, RADIUS)
     out_column, at = np.arange(columns), np.arange(columns - 1)
     hilbert = 1 / (math.pi * (out_column[:, None] - at - 0.5)) * np.sign(helix.pitch_u)
     lines = np.empty((helix.views - 1, len(psi), columns))
@@ -126,8 +126,8 @@ def test_chunks_and_offsets_change_nothing(context, kind, request, monkeypatch):
     expected = cl_array.empty(queue, shape, np.float32)
     whole(queue, expected, cl_array.to_device(queue, image)).wait()
     # room for two views' lines, and for the transforms of a part of them
-    monkeypatch.setattr(katsevich, "_CPU_BYTES", 2 * 4 * whole.padded * whole._count + 100)
-    monkeypatch.setattr(katsevich, "_MOST_LINES", 31)
+    monkeypatch.setattr(katsevich_filter, "_CPU_BYTES", 2 * 4 * whole.padded * whole._count + 100)
+    monkeypatch.setattr(katsevich_filter, "_MOST_LINES", 31)
     small = KatsevichFilter(context, BASE, RADIUS)
     assert small.scratch_bytes < whole.scratch_bytes
     out = cl_array.zeros(queue, (shape[0] + 1, *shape[1:]), np.float32)[1:]

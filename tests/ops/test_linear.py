@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse.linalg import lsqr
 
 import clra
-from clra.model.phantom import Ellipsoids
+from clra.model.phantoms.ellipsoids import Ellipsoids
 
 ADJOINT = 1e-6  # of the inner products, float32 sums
 RESIDUAL = 0.02  # LSQR's after 20 iterations, of the projections; 0.013 was seen

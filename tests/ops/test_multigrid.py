@@ -5,9 +5,9 @@ import pyopencl.array as cl_array
 import pytest
 
 from clra.model.grid import VolumeGrid
-from clra.ops.multigrid import Residual, add_update, cropped, prolongate, restrict
-from clra.ops.slabs import constant_volume, volume_from
-from clra.ops.streaming import Stream
+from clra.ops.streaming.multigrid import Residual, add_update, cropped, prolongate, restrict
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume_slabs import constant_volume, volume_from
 from tests.ops.test_pyramid import prolonged, restricted
 
 ROUNDING = 4e-7

@@ -7,12 +7,12 @@ import pyopencl.array as cl_array
 import pytest
 
 from clra.model.grid import VolumeGrid
-from clra.model.helix import Helix
-from clra.model.pi_intervals import pi_spans
-from clra.ops.pibackproject import PiBackProjector
+from clra.model.helix.helix import Helix
+from clra.model.helix.pi_intervals import pi_spans
+from clra.ops.projection.pi_backprojector import PiBackProjector
 
 RELATIVE = 1e-4  # of the largest magnitude: positions in float32, on noise
-BLEND = 8  # voxels, as in pibackproject.cl
+BLEND = 8  # voxels, as in pi_backprojector.cl
 RADIUS = 3.3
 
 BASE = Helix(

@@ -25,9 +25,9 @@ from projector_cases import (
 )
 
 from clra import ConeBeamGeometry, Motion, VolumeGrid, circular, helix
-from clra.model.phantom import Ellipsoids
-from clra.ops import projector
-from clra.ops.projector import BackProjector, ForwardProjector
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.ops.projection import projector
+from clra.ops.projection.projector import BackProjector, ForwardProjector
 
 ADJOINT = 1e-5  # of the inner product
 SPHERE = 5e-3  # root mean square over the largest line integral

@@ -19,8 +19,8 @@ from projector_cases import (
 )
 
 from clra import VolumeGrid, circular
-from clra.ops import layout, projector
-from clra.ops.projector import BackProjector, ForwardProjector
+from clra.ops.projection import layout, projector
+from clra.ops.projection.projector import BackProjector, ForwardProjector
 
 
 def test_set_geometry_is_a_new_operator(queue):

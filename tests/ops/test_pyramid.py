@@ -4,7 +4,7 @@ import pyopencl.array as cl_array
 import pytest
 from arrays import with_offset
 
-from clra.ops.pyramid import Prolong3D, Restrict2D, Restrict3D
+from clra.ops.images.pyramid import Prolong3D, Restrict2D, Restrict3D
 
 ROUNDING = 4e-7  # of values up to 1
 SHAPES = [(2, 2, 2), (3, 5, 7), (4, 6, 37), (5, 3, 64), (2, 9, 33)]

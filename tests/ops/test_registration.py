@@ -8,12 +8,13 @@ import pytest
 from scipy import ndimage
 
 from clra.model.motion import Motion
-from clra.ops import opencl, registration
-from clra.ops.bandpass import Bandpass
-from clra.ops.lines import MARGIN, line_stride
-from clra.ops.registration import ESTIMATE_FIELDS, Registration
-from clra.ops.steps import Step, to_device
-from clra.ops.windows import registration_window
+from clra.ops.images.bandpass import Bandpass
+from clra.ops.registration import gauss_newton
+from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
+from clra.ops.registration.windows import registration_window
+from clra.ops.runtime import build
+from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.lines import MARGIN, line_stride
 
 # Errors on 256 x 256 pixels, median over pairs.
 SHIFT_BAR, MAGNIFICATION_BAR = 0.03, 2e-4
@@ -266,7 +267,7 @@ def test_sums_of_the_normal_equations(context, queue, group):
     blocks, block_rows, radius = 4, 5, 0.5 * math.hypot(rows, columns)
     sums = cl_array.zeros(queue, (views, blocks, 36), np.float32)
     defines = {"GROUP": group}
-    Step(context, "registration_sums.cl", "normal_equations", (group, 1, 1), defines)(
+    Step(context, "gauss_newton_sums.cl", "normal_equations", (group, 1, 1), defines)(
         queue,
         (group, blocks, views),
         *(sums, to_device(context, mixed), views),
@@ -297,7 +298,7 @@ def test_gpu_form_agrees(context, queue, monkeypatch):
     """Work-groups that share a view, a pixel an item, the device's own FFT."""
     measured, simulated, _ = pairs(3, (60, 72), 4.0, counts=2000)
     expected = run(context, queue, measured, simulated)
-    monkeypatch.setattr(opencl, "is_cpu", lambda device: False)
+    monkeypatch.setattr(build, "is_cpu", lambda device: False)
     found = run(context, queue, measured, simulated)
     for name in ("shift_u", "shift_v"):
         np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=2e-3)
@@ -456,11 +457,11 @@ def test_bad_arrays_are_refused(context, queue):
         operator(queue, out, good, good[:1])
     with pytest.raises(ValueError, match="estimates_out: found shape"):
         operator(queue, out[:1], good, good)
-    other = cl.Context([opencl.device_of(context)])
+    other = cl.Context([build.device_of(context)])
     foreign = cl_array.zeros(cl.CommandQueue(other), (2, 64, 80), np.float32)
     with pytest.raises(ValueError, match="simulated: its context"):
         operator(queue, out, good, foreign)
 
 
 def test_state_is_as_long_as_the_kernels_say():
-    assert (registration._STATE, registration._SUMS) == (8, 36)
+    assert (gauss_newton._STATE, gauss_newton._SUMS) == (8, 36)

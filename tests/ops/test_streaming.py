@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import clra
-from clra.methods.fbp import ramp_fbp
+from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid
-from clra.ops import opencl
-from clra.ops.memory import DeviceMemoryError
-from clra.ops.streaming import Radiographs, Stream, Volume
+from clra.ops.runtime import build
+from clra.ops.streaming.memory import DeviceMemoryError
+from clra.ops.streaming.stream import Radiographs, Stream, Volume
 
 PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
 
@@ -92,7 +92,7 @@ def test_a_device_with_its_own_memory_gets_copies(budget, monkeypatch):
     pixels = np.random.default_rng(2).random((60, 12, 16), np.float32)
     volumes = []
     for shared in (True, False):
-        monkeypatch.setattr(opencl, "is_cpu", lambda device, shared=shared: shared)
+        monkeypatch.setattr(build, "is_cpu", lambda device, shared=shared: shared)
         stream = Stream(max_device_memory=budget)
         monkeypatch.undo()
         assert stream.budgets.shared == shared

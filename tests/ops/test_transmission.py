@@ -5,7 +5,7 @@ import pyopencl.array as cl_array
 import pytest
 from arrays import with_offset
 
-from clra.ops.transmission import RayStatistics, VolumeStep
+from clra.ops.statistics.poisson import RayStatistics, VolumeStep
 
 SHAPE = (5, 7, 9)  # views, rows, columns
 BACKGROUND = 3.0

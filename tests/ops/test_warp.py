@@ -4,8 +4,8 @@ import pyopencl.array as cl_array
 import pytest
 from scipy import ndimage
 
-from clra.ops import warp
-from clra.ops.warp import Warp
+from clra.ops.images import warp
+from clra.ops.images.warp import Warp
 
 IDENTITY = 1e-6  # of values up to 1: rounding of the coefficients
 SPLINE = 1e-5  # likewise, where they are interpolated

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from clra.ops.windows import registration_window, tukey
+from clra.ops.registration.windows import registration_window, tukey
 
 
 def test_tukey_is_symmetric_and_flat_in_the_middle():
