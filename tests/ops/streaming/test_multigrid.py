@@ -8,7 +8,7 @@ from clra.model.grid import VolumeGrid
 from clra.ops.streaming.multigrid import Residual, add_update, cropped, prolongate, restrict
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume_slabs import constant_volume, volume_from
-from tests.ops.test_pyramid import prolonged, restricted
+from tests.ops.images.test_pyramid import prolonged, restricted
 
 ROUNDING = 4e-7
 SHAPES = [(12, 5, 7), (13, 6, 4), (27, 9, 8)]

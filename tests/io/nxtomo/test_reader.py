@@ -14,7 +14,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.trajectory import circular, double_helix, helix, space_filling
 
-from .conftest import COLUMNS, ROLES, ROWS, VIEWS, Builder, put, transmission
+from ..conftest import COLUMNS, ROLES, ROWS, VIEWS, Builder, put, transmission
 
 # Rounding of degrees and of the distances' differences, relative to the scanner's size.
 ROUNDING = 1e-12
