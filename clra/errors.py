@@ -1,4 +1,4 @@
-"""Errors of reading and writing; each message is one line."""
+"""What clra raises and warns of; each message is one line, but for a compiler's log."""
 
 from __future__ import annotations
 
@@ -79,3 +79,19 @@ class OutputError(OSError):
             text += f" ({reason})"
         advice = None if number is None else _ADVICE.get(errno.errorcode.get(number, ""))
         return cls(f"cannot write {os.fspath(path)}: {text}{f'; {advice}' if advice else ''}")
+
+
+class DeviceError(RuntimeError):
+    """No usable OpenCL device: there is none, none of that name, or it fails the self-test."""
+
+
+class KernelBuildError(DeviceError):
+    """A kernel did not compile; the message carries the compiler's log."""
+
+
+class Cancelled(Exception):  # noqa: N818  (an answer to a callback, not a fault)
+    """Raised by a progress callback to end a long call early, keeping what is finished."""
+
+
+class ClraWarning(UserWarning):
+    """A result, or the machine, is not as good as it might be."""

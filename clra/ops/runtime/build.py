@@ -94,23 +94,11 @@ def builds(context: cl.Context) -> Builds:
 
 
 def _compile(context: cl.Context, name: str, options: Sequence[str]) -> cl.Program:
-    try:
-        return _compile_once(context, name, options)
-    except KernelBuildError as error:
-        mended = pocl.SYMPTOM in str(error) and [
-            device for device in context.devices if pocl.mend_cpu_name(device)
-        ]
-        if not mended:
-            raise
-    return _compile_once(context, name, options)
-
-
-def _compile_once(context: cl.Context, name: str, options: Sequence[str]) -> cl.Program:
     # pyopencl's public build() adds an include path, which breaks several drivers where it holds a
     # blank, and a binary cache that outlives driver updates; drivers cache by themselves.
     program = cl._cl._Program(context, kernels.source(name))
     try:
-        program.build(" ".join(options).encode())
+        program.build(" ".join((*options, *pocl.build_options(context.devices))).encode())
     except cl.Error as error:
         raise KernelBuildError(f"kernel {name} does not build: {error}") from None
     built = cl.Program(program)

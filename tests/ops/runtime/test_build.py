@@ -1,7 +1,5 @@
-"""Builds, argument checks; and the cure for PoCL on CPUs it does not know."""
+"""Builds and argument checks."""
 
-import io
-import struct
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +11,7 @@ import pytest
 
 from clra import kernels
 from clra.ops.images.pyramid import Restrict2D
-from clra.ops.runtime import build, pocl
+from clra.ops.runtime import build
 
 
 def test_build_is_cached_and_a_kernel_is_not(context):
@@ -98,42 +96,3 @@ def test_offset_is_counted_in_elements(queue):
 
 def test_global_size_rounds_up():
     assert build.global_size((5, 8, 1), (4, 8, 1)) == (8, 8, 1)
-
-
-class _Memory(io.BytesIO):
-    """Stands for the process's memory: a device record at 64, the name's text at 512."""
-
-    def __init__(self, text: bytes) -> None:
-        record = bytearray(4096)
-        struct.pack_into("PP", record, 64 + 16, 0xDEAD0000, 512)
-        record[512 : 512 + len(text)] = text
-        super().__init__(bytes(record))
-
-
-def test_mending_points_the_record_at_a_known_cpu():
-    import ctypes
-
-    memory = _Memory(b"generic\0")
-    assert pocl._replace(memory, 64, b"haswell")
-    (address,) = struct.unpack_from("P", memory.getvalue(), 64 + 24)
-    assert ctypes.string_at(address) == b"haswell"
-
-
-def test_mending_leaves_a_record_without_the_name_alone():
-    memory = _Memory(b"generic-ish\0")
-    before = memory.getvalue()
-    assert not pocl._replace(memory, 64, b"haswell")
-    assert memory.getvalue() == before
-
-
-@pytest.mark.parametrize(
-    ("flags", "cpu"),
-    [
-        ("sse2", b"x86-64"),
-        ("avx2 fma bmi2 movbe f16c", b"haswell"),
-        ("avx2 fma bmi2 movbe f16c avx512f avx512bw avx512dq avx512vl", b"skylake-avx512"),
-        ("avx2 fma bmi2 movbe f16c avx512f", b"haswell"),
-    ],
-)
-def test_the_widest_cpu_that_this_one_covers_is_taken(flags, cpu):
-    assert pocl._closest_cpu(set(flags.split())) == cpu
