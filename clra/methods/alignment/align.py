@@ -9,8 +9,10 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.preparation import prepared
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.model.corrections.options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -39,6 +41,7 @@ def align(
     solver: Solver | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -81,6 +84,8 @@ def align(
         Parts of the iteration, to switch some off.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
 
     Returns
     -------
@@ -106,6 +111,7 @@ def align(
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
     # What the mask leaves of the detector is aligned as a detector of its own.
+    scan = prepared(scan, corrections, progress=progress).scan
     whole, scan = scan, scan.cropped()
     aside = whole.window_offset
     stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
@@ -119,7 +125,10 @@ def align(
     motion = None if motion is None else motion.about(*aside)
     if reference is not None:
         if reference.geometry.shape == whole.geometry.shape:
-            reference = replace(reference, mask=whole.mask).cropped()
+            reference = replace(
+                reference, mask=whole.mask, corrections=whole.corrections_of_detector()
+            )
+            reference = reference.cropped()
         drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
         if method == "reference":
             return _on_detector(drift, whole)
