@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra import kernels as kernels
-    from clra.io.scans import read_scan as read_scan
-    from clra.methods.alignment import align as align
+    from clra.io.scan_files import read_scan as read_scan
+    from clra.methods.alignment.align import align as align
     from clra.methods.correction import correct as correct
-    from clra.methods.reconstruction import reconstruct as reconstruct
+    from clra.methods.reconstruction.reconstruct import reconstruct as reconstruct
     from clra.model.geometry import ConeBeamGeometry as ConeBeamGeometry
     from clra.model.grid import VolumeGrid as VolumeGrid
     from clra.model.motion import Motion as Motion
@@ -22,10 +22,10 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.model.trajectory import helix as helix
     from clra.model.trajectory import space_filling as space_filling
     from clra.ops.alignment_step import AlignmentStep as AlignmentStep
-    from clra.ops.devices import devices as devices
-    from clra.ops.linear import as_linear_operator as as_linear_operator
-    from clra.ops.projector import BackProjector as BackProjector
-    from clra.ops.projector import ForwardProjector as ForwardProjector
+    from clra.ops.projection.linear_operator import as_linear_operator as as_linear_operator
+    from clra.ops.projection.projector import BackProjector as BackProjector
+    from clra.ops.projection.projector import ForwardProjector as ForwardProjector
+    from clra.ops.runtime.devices import devices as devices
 
 _HOMES = {
     "ConeBeamGeometry": "clra.model.geometry",
@@ -36,15 +36,15 @@ _HOMES = {
     "VolumeGrid": "clra.model.grid",
     "Motion": "clra.model.motion",
     "Scan": "clra.model.scan",
-    "read_scan": "clra.io.scans",
-    "align": "clra.methods.alignment",
-    "reconstruct": "clra.methods.reconstruction",
+    "read_scan": "clra.io.scan_files",
+    "align": "clra.methods.alignment.align",
+    "reconstruct": "clra.methods.reconstruction.reconstruct",
     "correct": "clra.methods.correction",
-    "devices": "clra.ops.devices",
-    "ForwardProjector": "clra.ops.projector",
-    "BackProjector": "clra.ops.projector",
+    "devices": "clra.ops.runtime.devices",
+    "ForwardProjector": "clra.ops.projection.projector",
+    "BackProjector": "clra.ops.projection.projector",
     "AlignmentStep": "clra.ops.alignment_step",
-    "as_linear_operator": "clra.ops.linear",
+    "as_linear_operator": "clra.ops.projection.linear_operator",
 }
 
 __all__ = ["kernels", *_HOMES]

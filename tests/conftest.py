@@ -7,14 +7,14 @@ from pathlib import Path
 import pyopencl as cl
 import pytest
 
-from clra.ops import opencl
-from clra.ops.devices import create_context
+from clra.ops.runtime import build
+from clra.ops.runtime.devices import create_context
 
 
 @pytest.fixture(scope="session")
 def context() -> Iterator[cl.Context]:
     context = create_context()
-    builds = opencl.builds(context)  # held, so that the tests compile once
+    builds = build.builds(context)  # held, so that the tests compile once
     yield context
     del builds
 

@@ -9,20 +9,20 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 
 import clra
-from clra.model.helix import Helix
-from clra.model.phantom import porous
-from clra.ops.bandpass import Bandpass
-from clra.ops.correlation import PhaseCorrelation
-from clra.ops.coverage import Coverage
-from clra.ops.fft import RealFFT
-from clra.ops.filtering import RampFilter
-from clra.ops.katsevich import KatsevichFilter
-from clra.ops.multigrid import Residual
-from clra.ops.pibackproject import PiBackProjector
-from clra.ops.pyramid import Prolong3D, Restrict2D, Restrict3D
-from clra.ops.registration import Registration
-from clra.ops.transmission import RayStatistics, VolumeStep
-from clra.ops.warp import Warp
+from clra.model.helix.helix import Helix
+from clra.model.phantoms.ellipsoids import porous
+from clra.ops.filtering.fft import RealFFT
+from clra.ops.filtering.katsevich_filter import KatsevichFilter
+from clra.ops.filtering.ramp import RampFilter
+from clra.ops.images.bandpass import Bandpass
+from clra.ops.images.pyramid import Prolong3D, Restrict2D, Restrict3D
+from clra.ops.images.warp import Warp
+from clra.ops.projection.coverage import Coverage
+from clra.ops.projection.pi_backprojector import PiBackProjector
+from clra.ops.registration.gauss_newton import Registration
+from clra.ops.registration.phase_correlation import PhaseCorrelation
+from clra.ops.statistics.poisson import RayStatistics, VolumeStep
+from clra.ops.streaming.multigrid import Residual
 
 FORMS = 2e-5  # of the largest value: forms of a kernel for CPU and GPU differ by roundings
 REGISTERED = 1e-3  # likewise, for estimates that iterate to this

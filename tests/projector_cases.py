@@ -8,7 +8,7 @@ import pytest
 from geometries import upside_down
 
 from clra import ConeBeamGeometry, Motion, VolumeGrid, circular, helix, space_filling
-from clra.ops.projector import BackProjector, ForwardProjector
+from clra.ops.projection.projector import BackProjector, ForwardProjector
 
 ROUNDING = 2e-5  # of the largest value: float32 along a line of some tens of samples
 

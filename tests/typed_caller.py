@@ -10,10 +10,10 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 
 import clra
-from clra.methods.results import AlignmentResult
-from clra.ops.devices import DeviceInfo
-from clra.ops.registration import ESTIMATE_FIELDS
-from clra.ops.warp import Warp
+from clra.methods.alignment.result import AlignmentResult
+from clra.ops.images.warp import Warp
+from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS
+from clra.ops.runtime.devices import DeviceInfo
 
 geometry = clra.circular(
     360, source_to_axis=20.0, source_to_detector=50.0, pixel_size=0.1, shape=(64, 64)

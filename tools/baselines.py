@@ -12,8 +12,8 @@ import numpy as np
 from paper_sets import SAMPLE, VOXEL, geometry_of
 
 import clra
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.model.phantom import three_spheres
+from clra.model.phantoms.ellipsoids import three_spheres
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 
 EVERY = 12
 HEAD = (

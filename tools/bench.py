@@ -21,7 +21,7 @@ from bench_cases import CASES, LONG, Bench, Case, Value
 from bench_first_use import first_use
 from bench_peers import PEERS, Peer, threads
 
-from clra.ops.devices import create_context
+from clra.ops.runtime.devices import create_context
 
 
 def measured(case: Case, repeats: int) -> Value:

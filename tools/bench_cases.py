@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from paper_sets import SAMPLE, VOXEL, geometry_of, moved_scan, project
 
 import clra
-from clra.model.perturbation import random_motion
-from clra.model.phantom import Ellipsoids, porous
-from clra.ops.filtering import RampFilter
-from clra.ops.registration import ESTIMATE_FIELDS, Registration
+from clra.model.phantoms.ellipsoids import Ellipsoids, porous
+from clra.model.phantoms.perturbation import random_motion
+from clra.ops.filtering.ramp import RampFilter
+from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
 
 Floats = NDArray[np.float32]
 

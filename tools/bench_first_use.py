@@ -31,7 +31,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array
 import clra
-from clra.ops.devices import create_context
+from clra.ops.runtime.devices import create_context
 random = np.random.default_rng(0)
 geometry = clra.circular(16, source_to_axis=100.0, source_to_detector=150.0, pixel_size=0.6,
                          shape=(64, 64))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra import ConeBeamGeometry, VolumeGrid
-from clra.io.geometries import write_rtk_geometry
+from clra.io.motion_formats.rtk import write_rtk_geometry
 
 Floats = NDArray[np.float32]
 Run = Callable[[], Any]

@@ -6,7 +6,7 @@ import sysconfig
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from clra.ops.opencl import BUILD_OPTIONS
+from clra.ops.runtime.build import BUILD_OPTIONS
 
 APT = "apt-get install -y --no-install-recommends"
 

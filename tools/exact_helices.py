@@ -15,11 +15,11 @@ import numpy as np
 from scipy import ndimage
 
 import clra
-from clra.methods.fbp import ramp_fbp
-from clra.methods.katsevich import katsevich
+from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.reconstruction.katsevich import katsevich
 from clra.model.grid import VolumeGrid
-from clra.model.phantom import Ellipsoids, three_spheres
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
+from clra.ops.streaming.stream import Radiographs, Stream
 
 SOURCE_TO_AXIS, SOURCE_TO_DETECTOR, FIELD, COLUMNS = 3.0, 6.0, 1.05, 160  # mm; FIELD is a radius
 PHANTOMS = {

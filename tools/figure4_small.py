@@ -22,17 +22,17 @@ from pathlib import Path
 import numpy as np
 
 import clra
-from clra.app.findings import findings_of
 from clra.app.records import Record
-from clra.app.report import write_report
-from clra.io.scans import write_scan
-from clra.io.volumes import write_volume
-from clra.methods.results import AlignmentResult
-from clra.model.gauge import sample_points, without_gauge
+from clra.app.report.html_report import write_report
+from clra.app.report.summary import findings_of
+from clra.io.scan_files import write_scan
+from clra.io.volumes.volume_files import write_volume
+from clra.methods.alignment.result import AlignmentResult
+from clra.model.gauge.gauge import sample_points, without_gauge
 from clra.model.grid import default_grid
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.model.phantom import Ellipsoids
-from clra.model.wood import wood
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
+from clra.model.phantoms.wood import wood
 
 VIEWS, PIXELS, PIXEL, PLANES = 7068, 3040, 0.139, 5240  # a helix; along a side; mm; of the volume
 SOURCE_TO_AXIS, SOURCE_TO_DETECTOR = 2.8823, 315.5  # mm

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from compilers import APT, clang, data, defined, program, run
 
-from clra.ops.opencl import BUILD_OPTIONS
+from clra.ops.runtime.build import BUILD_OPTIONS
 
 MOST_REGISTERS = 64
 
@@ -23,18 +23,18 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "backproject.cl": (256, {"LANES": 1}),
     "bandpass.cl": (32, {"LANES": 2}),
     "blur.cl": (32, {"LANES": 2}),
-    "correlation.cl": (64, {"LANES": 2, "GROUP": 64}),
+    "phase_correlation.cl": (64, {"LANES": 2, "GROUP": 64}),
     "coverage.cl": (64, {}),
     "fft.cl": (64, {}),
-    "filtering.cl": (128, {"LANES": 2}),
+    "ramp.cl": (128, {"LANES": 2}),
     "forwardproject.cl": (256, {"LANES": 1}),
-    "katsevich.cl": (32, {"LANES": 2}),
+    "katsevich_filter.cl": (32, {"LANES": 2}),
     "multigrid.cl": (64, {}),
-    "pibackproject.cl": (256, {"LANES": 1, "BLOCK": 1}),
+    "pi_backprojector.cl": (256, {"LANES": 1, "BLOCK": 1}),
     "pyramid.cl": (128, {"LANES": 2}),
-    "registration.cl": (1, {}),
-    "registration_sums.cl": (64, {"GROUP": 64}),
-    "transmission.cl": (64, {}),
+    "gauss_newton.cl": (1, {}),
+    "gauss_newton_sums.cl": (64, {"GROUP": 64}),
+    "poisson.cl": (64, {}),
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),
 }

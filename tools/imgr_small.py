@@ -22,15 +22,15 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 import clra
-from clra.methods.fbp import ramp_fbp
-from clra.methods.imgr import imgr
-from clra.methods.osem_tr import OrderedSubsets
-from clra.model.gauge import Gauge, sample_points, without_gauge
+from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.reconstruction.imgr import imgr
+from clra.methods.reconstruction.osem_tr import OrderedSubsets
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.ops.slabs import SlabProjector, constant_volume, volume_from
-from clra.ops.streaming import Radiographs, Stream
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
+from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.volume_slabs import SlabProjector, constant_volume, volume_from
 
 PIXEL, COLUMNS, VIEWS, PLANES = 0.139, 2304, 4858, 5428  # the paper's
 PHOTONS = 1e4

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import clra
-from clra.io.volumes import read_volume
+from clra.io.volumes.volume_files import read_volume
 
 INK, BLUE, ORANGE = "#1f2933", "#0072b2", "#d55e00"
 

@@ -25,8 +25,8 @@ HEAD = (
 
 
 def simulate(path: Path, views: int, panel: tuple[int, int]) -> None:
-    from clra.app.simulate import paper_like, sample, simulated_motion, simulated_scan
-    from clra.io.scans import write_scan
+    from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
+    from clra.io.scan_files import write_scan
 
     geometry = paper_like("helix", views, panel)
     truth = simulated_motion("both", geometry, shift=(-3, 3), magnification=0.0, seed=0)
@@ -44,8 +44,8 @@ def child(method: str, scan_path: Path, out: Path, host: int | None, device: int
         Memory(max_host_memory=str(host)).limits()  # as the command line does
     live = _count_buffers()
     import clra
-    from clra.io.volumes import open_volume
-    from clra.methods.reconstruction import reconstruct_into
+    from clra.io.volumes.volume_files import open_volume
+    from clra.methods.reconstruction.reconstruct import reconstruct_into
     from clra.model.grid import default_grid
 
     scan = clra.read_scan(scan_path)
@@ -88,7 +88,7 @@ def _count_buffers() -> list[int]:
             live[0] -= self.own
 
     cl.Buffer = Counted
-    from clra.ops import memory
+    from clra.ops.streaming import memory
 
     tell = memory._Counted.__del__
 
@@ -119,10 +119,10 @@ def measured(method: str, scan: Path, folder: Path, host: int | None, device: in
 def predicted(method: str, path: Path, host: int, device: int) -> Any:
     """Ask what clra info would say."""
     import clra
-    from clra.methods.needs import alignment_need, multigrid_need, reconstruction_need
+    from clra.methods.memory_estimate import alignment_need, multigrid_need, reconstruction_need
     from clra.model.grid import default_grid
-    from clra.ops.devices import choose_device
-    from clra.ops.memory import Budgets
+    from clra.ops.runtime.devices import choose_device
+    from clra.ops.streaming.memory import Budgets
 
     geometry = clra.read_scan(path).geometry
     grid = default_grid(geometry)
@@ -138,7 +138,7 @@ def predicted(method: str, path: Path, host: int, device: int) -> Any:
 def difference(method: str, one: Path, other: Path) -> str:
     """How far two results are apart."""
     import clra
-    from clra.io.volumes import read_volume
+    from clra.io.volumes.volume_files import read_volume
 
     if method == "align":
         first, second = clra.Motion.load(one), clra.Motion.load(other)

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import clra
-from clra.model.gauge import Gauge, sample_points, without_gauge
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
-from clra.model.perturbation import random_motion, smooth_motion
-from clra.model.phantom import three_spheres
+from clra.model.phantoms.ellipsoids import three_spheres
+from clra.model.phantoms.perturbation import random_motion, smooth_motion
 from clra.model.trajectory import PAPER
 
 VIEWS, VOXEL, SAMPLE = 3456, 0.004544, (1248, 480)  # planes and columns of the phantom

@@ -37,11 +37,11 @@ OPERATORS = (KERNELS, "tests/ops/test_embedding.py")
 QUICK = (
     "tests/kernels",
     "tests/test_package.py",
-    "tests/ops/test_projector.py",
-    "tests/ops/test_projector_calls.py",
-    "tests/ops/test_registration.py",
-    "tests/ops/test_filtering.py",
-    "tests/ops/test_pibackproject.py",
+    "tests/ops/projection/test_projector.py",
+    "tests/ops/projection/test_projector_calls.py",
+    "tests/ops/registration/test_gauss_newton.py",
+    "tests/ops/filtering/test_ramp.py",
+    "tests/ops/projection/test_pi_backprojector.py",
     "tests/ops/test_other_stacks.py",
     KERNELS,
 )
@@ -129,7 +129,10 @@ def runs(quick: bool) -> dict[str, Run]:
             ),
         ),
         "same-numbers": Run(
-            ("tests/ops/test_runtimes.py", "tests/methods/test_katsevich_runtimes.py"),
+            (
+                "tests/ops/test_runtimes.py",
+                "tests/methods/reconstruction/test_katsevich_runtimes.py",
+            ),
             neither,
             rusticl,
             icds=(INTEL, RUSTICL),
@@ -181,7 +184,7 @@ def run(name: str, one: Run, folder: Path) -> tuple[str, str]:
 
 
 _DEVICE = """
-from clra.ops.devices import choose_device
+from clra.ops.runtime.devices import choose_device
 device = choose_device()
 print(device.name.strip(), "of", device.platform.name, device.platform.version)
 """

@@ -11,9 +11,9 @@ import pyopencl.array as cl_array
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from clra.ops.correlation import PhaseCorrelation
-from clra.ops.registration import Registration
-from clra.ops.streaming import Stream
+from clra.ops.registration.gauss_newton import Registration
+from clra.ops.registration.phase_correlation import PhaseCorrelation
+from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from draw_figure3 import draw
 from paper_sets import SETS, errors, moved_scan, rest
 
 import clra
-from clra.methods.solver import Solver
+from clra.methods.alignment.options import Solver
 
 SCHEDULES = ("4FR", "1QR-1HR", "2QR-2HR", "auto")
 ABLATION: dict[str, dict[str, Any]] = {

@@ -38,8 +38,8 @@ from paper_sets import SAMPLE as SIZE
 from reproduce_figure3 import HEAD, row
 
 import clra
-from clra.app.simulate import counted
-from clra.model.gauge import Gauge, sample_points, without_gauge
+from clra.app.simulation import counted
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.scan import Projections
 

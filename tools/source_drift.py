@@ -14,14 +14,18 @@ of the paper's panel.
 import numpy as np
 
 import clra
-from clra.methods.fbp import ramp_fbp
-from clra.methods.level import reprojections
-from clra.methods.reprojection import registration_for, reproject_and_register, with_margin
-from clra.model.gauge import Gauge, sample_points, without_gauge
+from clra.methods.alignment.level import reprojections
+from clra.methods.alignment.reprojection import (
+    registration_for,
+    reproject_and_register,
+    with_margin,
+)
+from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
-from clra.model.perturbation import smooth_motion
-from clra.model.phantom import porous
-from clra.ops.streaming import Radiographs, Stream, Volume
+from clra.model.phantoms.ellipsoids import porous
+from clra.model.phantoms.perturbation import smooth_motion
+from clra.ops.streaming.stream import Radiographs, Stream, Volume
 
 PANEL, SOURCE, DETECTOR = 422.56, 2.8823, 315.5  # mm
 PAPER_PIXEL = 139.0  # um

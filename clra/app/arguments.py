@@ -106,7 +106,7 @@ def volume_file(path: Path) -> None:
     ValueError
         If there is no such format.
     """
-    from clra.io.volumes import HDF5, TIFF
+    from clra.io.volumes.volume_files import HDF5, TIFF
 
     expected = ", ".join((HDF5[0], *TIFF))
     if path.suffix.lower() == ".zarr":

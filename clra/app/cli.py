@@ -4,9 +4,9 @@ from typing import Annotated
 
 import typer
 
-from clra.app import commands_in, commands_out
+from clra.app.commands import commands_in, commands_out
 from clra.app.console import as_written
-from clra.app.errors import Group
+from clra.app.exit_status import Group
 
 app = typer.Typer(
     cls=Group,

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 import numpy as np
 import typer
 
-from clra.app import progress
+from clra.app import progress_bar
 
 if TYPE_CHECKING:
     from clra.model.scan import Scan
-    from clra.ops.streaming import Report
+    from clra.ops.streaming.stream import Report
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Console:
 
     def progress(self) -> AbstractContextManager["Report"]:
         """Show progress on stderr while a block runs, unless quiet."""
-        return progress.shown(self.quiet)
+        return progress_bar.shown(self.quiet)
 
     def result(self, values: Mapping[str, Any], text: str) -> None:
         """Print what a command was run for: JSON, or text for people."""
@@ -125,7 +125,7 @@ class Reading:
     def scan(self, path: Path) -> "Scan":
         """Open a scan; its radiographs are read when they are needed."""
         from clra.app.plausible import warn_of_scale
-        from clra.io.scans import read_scan
+        from clra.io.scan_files import read_scan
 
         scan = read_scan(
             path,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.app.describe import path_of
 from clra.app.plausible import doubt_of_turning
-from clra.io.motions import MotionFile, read_motion_file, write_motion_file
-from clra.io.scans import scan_checksum
-from clra.methods.outliers import all_but
-from clra.methods.results import AlignmentResult, Iteration
+from clra.app.scan_description import path_of
+from clra.io.motion_file import MotionFile, read_motion_file, write_motion_file
+from clra.io.scan_files import scan_checksum
+from clra.methods.alignment.rejected_views import all_but
+from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 

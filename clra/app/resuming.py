@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.app.records import history_of
-from clra.io.errors import InputError, OutputError
-from clra.io.motions import read_motion_file, write_motion_file
-from clra.io.scans import scan_checksum
-from clra.io.volumes import open_volume, read_volume
-from clra.methods.multigrid import Progressed, Step
-from clra.methods.reprojection import with_margin
+from clra.errors import InputError, OutputError
+from clra.io.motion_file import read_motion_file, write_motion_file
+from clra.io.scan_files import scan_checksum
+from clra.io.volumes.volume_files import open_volume, read_volume
+from clra.methods.alignment.reprojection import with_margin
+from clra.methods.reconstruction.imgr_state import Progressed, Step
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.model.schedule import level_factor
-from clra.ops.slabs import volume_from
-from clra.ops.streaming import Stream
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume_slabs import volume_from
 
 
 class Leftover:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clra.app.describe import path_of
+from clra.app.scan_description import path_of
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 
 if TYPE_CHECKING:
-    from clra.ops.memory import Budgets
-    from clra.ops.streaming import Report, Stream
+    from clra.ops.streaming.memory import Budgets
+    from clra.ops.streaming.stream import Report, Stream
 
 # Size of the test: views, and the most columns of a radiograph. It takes about a second on two
 # cores; with half of the columns launching counts and the estimate is a third too long.
@@ -104,7 +104,7 @@ def measure(
     geometry : ConeBeamGeometry
         Of the scan.
     device : str or cl.Device, optional
-        As :func:`clra.ops.devices.choose_device` takes it.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it.
     report : callable, optional
         Told how far the test is.
     max_device_memory, max_host_memory : int, optional
@@ -115,11 +115,11 @@ def measure(
     Speed
         The first run of each operation, which builds its kernels, is not counted.
     """
-    from clra.ops.filtering import RampFilter
-    from clra.ops.memory import Budgets
-    from clra.ops.projector import BackProjector, ForwardProjector
-    from clra.ops.registration import ESTIMATE_FIELDS, Registration
-    from clra.ops.streaming import Stream
+    from clra.ops.filtering.ramp import RampFilter
+    from clra.ops.projection.projector import BackProjector, ForwardProjector
+    from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
+    from clra.ops.streaming.memory import Budgets
+    from clra.ops.streaming.stream import Stream
 
     stream = Stream(device, report=report)
     context, queue = stream.context, stream.queue
@@ -164,10 +164,10 @@ def _exact_work(
     stream: "Stream", geometry: ConeBeamGeometry, level: int
 ) -> tuple[tuple[str, Callable[[], Any], float], ...]:
     """Name, test and amount of each kind of work of Katsevich's method; none where it cannot."""
-    from clra.model.helix_fit import fit_helices
-    from clra.model.pi_intervals import field_of_view
-    from clra.ops.katsevich import KatsevichFilter
-    from clra.ops.pibackproject import PiBackProjector
+    from clra.model.helix.fit import fit_helices
+    from clra.model.helix.pi_intervals import field_of_view
+    from clra.ops.filtering.katsevich_filter import KatsevichFilter
+    from clra.ops.projection.pi_backprojector import PiBackProjector
 
     try:
         fit_helices(geometry)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from clra.io.errors import InputError, OutputError
+from clra.errors import InputError, OutputError
 
 # HDF5 tells the system's errno only inside its message.
 _HDF5_ERRNO = re.compile(r"errno = (\d+)")

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.io.errors import InputError
+from clra.errors import InputError
 from clra.io.units import TO_MM, TO_RADIANS, factor
 
 Floats = NDArray[np.float64]

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming import Stream
-from clra.ops.warp import Warp
+from clra.ops.images.warp import Warp
+from clra.ops.streaming.stream import Stream
 
 
 def correct(
@@ -32,7 +32,7 @@ def correct(
     motion : Motion
         Of its views, as :func:`clra.align` found it.
     device : str or cl.Device, optional
-        As :func:`clra.ops.devices.choose_device` takes it.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.outliers import odd, sums_of
-from clra.ops.streaming import Radiographs
+from clra.methods.alignment.rejected_views import odd, sums_of
+from clra.ops.streaming.stream import Radiographs
 
 # Views that are looked at, and the part of the largest line integral, as means over rows, that may
 # be left at a border. Scatter and unevenness of the open beam leave one or two per cent; a sample

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clra.model.checks import panel_shape, same_views, selection, vectors, whole
+from clra.model.validation import panel_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
     from clra.model.motion import Motion

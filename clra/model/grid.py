@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.model.checks import positive, whole
+from clra.model.validation import positive, whole
 
 if TYPE_CHECKING:
     from clra.model.geometry import ConeBeamGeometry

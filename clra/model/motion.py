@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clra.model.checks import column, same_views, selection, whole
+from clra.model.validation import column, same_views, selection, whole
 
 Floats = NDArray[np.float64]
 
@@ -201,7 +201,7 @@ class Motion:
         """
         # The one import from a floor above: a value does not know its file format, but the public
         # face wants it to be saved by a method.
-        from clra.io.motions import write_motion_file
+        from clra.io.motion_file import write_motion_file
 
         write_motion_file(path, self)
 
@@ -219,7 +219,7 @@ class Motion:
         InputError
             If it is no motion file.
         """
-        from clra.io.motions import read_motion_file
+        from clra.io.motion_file import read_motion_file
 
         return read_motion_file(path).motion
 

@@ -10,10 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clra.model.checks import selection
+from clra.model.bad_pixels import Patches
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
-from clra.model.patches import Patches
+from clra.model.validation import selection
 
 KINDS = ("line-integrals", "transmission")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.model.checks import whole
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.model.validation import whole
 
 Views = NDArray[np.intp]
 

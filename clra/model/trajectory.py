@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.model.checks import finite, positive, whole
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.validation import finite, positive, whole
 
 Floats = NDArray[np.float64]
 

@@ -10,13 +10,13 @@ from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.ops import opencl
-from clra.ops.coverage import Coverage
-from clra.ops.filtering import FADE, RampFilter, taper
-from clra.ops.layout import volume_shape
-from clra.ops.projector import BackProjector, ForwardProjector
-from clra.ops.registration import ESTIMATE_FIELDS, Registration
-from clra.ops.scratch import Allocator, Scratch, within
+from clra.ops.filtering.ramp import FADE, RampFilter, taper
+from clra.ops.projection.coverage import Coverage
+from clra.ops.projection.layout import volume_shape
+from clra.ops.projection.projector import BackProjector, ForwardProjector
+from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
+from clra.ops.runtime import build
+from clra.ops.runtime.buffers import Allocator, Scratch, within
 
 # Radiographs between two operations at a time; large enough for the launches to cost nothing.
 _CPU_BYTES, _GPU_BYTES = 32 << 20, 256 << 20
@@ -44,13 +44,13 @@ class AlignmentStep:
         Of the volume, which should hold the sample.
     row_weight : array_like, optional
         (rows,) weights of the detector's rows in the reconstruction; by default they fade out over
-        a tenth of the rows at the top and at the bottom, see :func:`clra.ops.filtering.taper`.
+        a tenth of the rows at the top and at the bottom, see :func:`clra.ops.filtering.ramp.taper`.
     volume_order : {"zyx", "yxz"}
         Axes of the volume. "yxz" is the kernels' own order and takes two scratch volumes less.
     low_pass, high_pass, mask, magnification, spread
-        As :class:`clra.ops.registration.Registration` takes them.
+        As :class:`clra.ops.registration.gauss_newton.Registration` takes them.
     allocator : callable, optional
-        Gives the scratch memory, see :class:`clra.ops.scratch.Scratch`.
+        Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
     scratch_limit : int, optional
         Bytes of scratch of each operation and of what passes between them: fewer radiographs are
         treated at a time, at least one.
@@ -91,7 +91,7 @@ class AlignmentStep:
         self._shape = (geometry.views, *geometry.shape)
         weights = taper(geometry.rows, FADE) if row_weight is None else row_weight
         memory = Scratch(context, allocator)
-        cpu = opencl.is_cpu(opencl.device_of(context))
+        cpu = build.is_cpu(build.device_of(context))
         most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
         views = min(geometry.views, max(1, most // (4 * geometry.rows * geometry.columns)))
         within_limits: dict[str, Any] = {"allocator": memory, "scratch_limit": scratch_limit}
@@ -155,8 +155,8 @@ class AlignmentStep:
             In order or out of order.
         estimates_out : cl.array.Array
             float32 (views, 10), overwritten, columns in the order of
-            :data:`clra.ops.registration.ESTIMATE_FIELDS`, as
-            :class:`~clra.ops.registration.Registration` gives them: shifts in pixels of these
+            :data:`clra.ops.registration.gauss_newton.ESTIMATE_FIELDS`, as
+            `Registration` gives them: shifts in pixels of these
             radiographs and magnification, to append by :meth:`clra.Motion.then`.
         volume_out : cl.array.Array
             float32 (nz, ny, nx), or (ny, nx, nz) if so constructed, overwritten [1/mm].
@@ -177,16 +177,16 @@ class AlignmentStep:
         TypeError, ValueError
             If an argument is none of the above.
         """
-        opencl.check_queue(queue, self._context)
+        build.check_queue(queue, self._context)
         views = self._shape[0]
         for name, array, shape in (
             ("estimates_out", estimates_out, (views, len(ESTIMATE_FIELDS))),
             ("volume_out", volume_out, self._volume_shape),
             ("radiographs", radiographs, self._shape),
         ):
-            opencl.check_array(name, array, shape, context=self._context)
+            build.check_array(name, array, shape, context=self._context)
         if known is not None:
-            opencl.check_array("known", known, (views,), context=self._context)
+            build.check_array("known", known, (views,), context=self._context)
         event = cl.enqueue_marker(queue, [*(wait_for or ()), *self._last])
         event = self._reconstruct(queue, volume_out, radiographs, event)
         for part in self._parts():

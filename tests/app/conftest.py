@@ -9,9 +9,9 @@ from typer.main import get_command
 
 from clra.app.cli import app
 from clra.app.records import Record
-from clra.app.simulate import paper_like, sample, simulated_motion, simulated_scan
-from clra.io.scans import write_scan
-from clra.methods.results import AlignmentResult, Iteration
+from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
+from clra.io.scan_files import write_scan
+from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import tifffile
 
-from clra.app import demo
+from clra.app import demonstration
 from clra.app.records import Record
-from clra.app.simulate import paper_like, sample
-from clra.io.motions import write_motion_file
-from clra.io.nxtomo_writing import write_nxtomo
-from clra.io.scans import read_scan, write_scan
-from clra.io.volumes import read_volume
-from clra.methods.autofocus import Focus
-from clra.methods.results import AlignmentInterrupted
+from clra.app.simulation import paper_like, sample
+from clra.io.motion_file import write_motion_file
+from clra.io.nxtomo.writer import write_nxtomo
+from clra.io.scan_files import read_scan, write_scan
+from clra.io.volumes.volume_files import read_volume
+from clra.methods.alignment.autofocus import Focus
+from clra.methods.alignment.result import AlignmentInterrupted
+from clra.model.detector_pose import with_panel
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
-from clra.model.panel import with_panel
 from clra.model.scan import Scan
 
 COMMANDS = (
@@ -91,7 +91,7 @@ def test_a_device_that_is_not_there_fails_with_what_there_is(clra):
 def test_without_any_device_there_is_advice_and_info_still_describes(
     clra, monkeypatch, scan_file, tmp_path
 ):
-    monkeypatch.setattr("clra.ops.devices._all_devices", list)
+    monkeypatch.setattr("clra.ops.runtime.devices._all_devices", list)
     refused(clra("devices"), 1, "PoCL")
     refused(clra("align", scan_file, "-o", tmp_path / "m.h5"), 1, "PoCL")
     code, out, err = clra("info", scan_file)
@@ -200,7 +200,9 @@ def test_align_to_a_reference_scan(clra, scan, scan_file, tmp_path):
 
 def test_an_auto_focus_goes_with_the_motion(clra, monkeypatch, scan_file, tmp_path):
     geometry = with_panel(read_scan(scan_file).geometry, offset_u=2.0, tilt=0.01)
-    monkeypatch.setattr("clra.methods.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25))
+    monkeypatch.setattr(
+        "clra.methods.alignment.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25)
+    )
     motion, fixed = tmp_path / "motion.h5", tmp_path / "fixed.nxs"
     code, out, err = clra("align", scan_file, "-o", motion, "--schedule", "1HR", "--autofocus")
     assert code == 0, err
@@ -244,7 +246,9 @@ def test_align_reconstruct_correct_report(clra, scan_file, tmp_path):
 
 def test_alignment_goes_on_from_a_motion(clra, monkeypatch, scan_file, tmp_path):
     first, last = tmp_path / "first.h5", tmp_path / "last.h5"
-    monkeypatch.setattr("clra.methods.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25))
+    monkeypatch.setattr(
+        "clra.methods.alignment.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25)
+    )
     assert clra("align", scan_file, "-o", first, "--schedule", "2HR", "--autofocus")[0] == 0
     code, out, err = clra(
         "align", scan_file, "-o", last, "--schedule", "1HR", "--start", first, "--json"
@@ -268,7 +272,7 @@ def test_ctrl_c_keeps_the_finished_iterations(clra, monkeypatch, result, scan_fi
     def interrupted(*_, **__):
         raise AlignmentInterrupted(result)
 
-    monkeypatch.setattr("clra.methods.alignment.align", interrupted)
+    monkeypatch.setattr("clra.methods.alignment.align.align", interrupted)
     motion = tmp_path / "m.h5"
     told = clra("align", scan_file, "-o", motion)
     refused(told, 130, "m.h5", "2 iterations", "HR", f"--start {motion}")
@@ -281,14 +285,14 @@ def test_ctrl_c_before_that_leaves_nothing(clra, monkeypatch, scan_file, tmp_pat
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("clra.methods.alignment.align", interrupted)
+    monkeypatch.setattr("clra.methods.alignment.align.align", interrupted)
     refused(clra("align", scan_file, "-o", tmp_path / "m.h5"), 130, "nothing was written")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_is_noticed_before_work(clra, monkeypatch, scan_file, tmp_path):
     full = shutil._ntuple_diskusage(100, 99, 1)
-    monkeypatch.setattr("clra.app.outputs.shutil.disk_usage", lambda path: full)
+    monkeypatch.setattr("clra.app.output_checks.shutil.disk_usage", lambda path: full)
     refused(clra("reconstruct", scan_file, "-o", tmp_path / "v.h5"), 1, "v.h5", "free some space")
 
 
@@ -363,8 +367,8 @@ def test_the_motion_of_another_scan_is_warned_of(clra, record, scan_file, tmp_pa
 
 
 def test_demo_shows_that_it_works(clra, monkeypatch, tmp_path):
-    small = partial(demo.run_demo, views=120, panel=(96, 72))
-    monkeypatch.setattr("clra.app.demo.run_demo", small)
+    small = partial(demonstration.run_demo, views=120, panel=(96, 72))
+    monkeypatch.setattr("clra.app.demonstration.run_demo", small)
     code, out, err = clra("demo", "--output", tmp_path / "d", "--json")
     assert code == 0, err
     told = json.loads(out)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clra.io.scans import read_scan, write_scan
-from clra.io.volumes import read_volume
+from clra.io.scan_files import read_scan, write_scan
+from clra.io.volumes.volume_files import read_volume
 from clra.model.grid import default_grid
 from clra.model.scan import Scan
 

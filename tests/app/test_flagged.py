@@ -7,10 +7,10 @@ import h5py
 import numpy as np
 import pytest
 
-from clra.app.simulate import paper_like, sample, simulated_motion
-from clra.io.motions import read_motion_file, write_motion_file
-from clra.io.scans import read_scan, write_scan
-from clra.io.volumes import read_volume
+from clra.app.simulation import paper_like, sample, simulated_motion
+from clra.io.motion_file import read_motion_file, write_motion_file
+from clra.io.scan_files import read_scan, write_scan
+from clra.io.volumes.volume_files import read_volume
 from clra.model.scan import Scan
 
 VIEWS, BLANK, SATURATED = 60, 11, 40

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from clra.io.scans import read_scan
-from clra.io.volumes import read_volume, write_volume
+from clra.io.scan_files import read_scan
+from clra.io.volumes.volume_files import read_volume, write_volume
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
-from clra.ops.streaming import Stream
+from clra.ops.streaming.stream import Stream
 from tests.app.test_cli import refused
 
 

@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from clra.app.simulate import paper_like, sample, simulated_scan
-from clra.io.scans import write_scan
-from clra.io.volumes import read_volume
+from clra.app.simulation import paper_like, sample, simulated_scan
+from clra.io.scan_files import write_scan
+from clra.io.volumes.volume_files import read_volume
 from clra.model.motion import Motion
 
 MIB = 1 << 20

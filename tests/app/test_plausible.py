@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clra.app.plausible import doubt_of_shifts, doubt_of_turning
-from clra.methods.quality import Quality
+from clra.methods.alignment.quality import Quality
 from clra.model.motion import Motion
 
 

@@ -3,10 +3,10 @@ import dataclasses
 import h5py
 import numpy as np
 
-from clra.app.findings import summary_of
 from clra.app.records import Record
-from clra.io.motions import write_motion_file
-from clra.io.scans import scan_checksum
+from clra.app.report.summary import summary_of
+from clra.io.motion_file import write_motion_file
+from clra.io.scan_files import scan_checksum
 from clra.model.motion import Motion
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from clra.errors import InputError, OutputError
 from clra.io import atomic
 from clra.io.atomic import atomic_path, ensure_writable
-from clra.io.errors import InputError, OutputError
 
 
 def test_file_appears_whole_with_usual_permissions(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import clra
 from clra.kernels.__main__ import HEADER, main, write
 from clra.kernels.header import header, signatures
-from clra.ops import opencl
+from clra.ops.runtime import build
 
 FILES = clra.kernels.names()
 
@@ -25,7 +25,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 def test_names_and_arguments_are_those_of_the_built_kernels(context, file, defines):
     built = {
         kernel.function_name: kernel.num_args
-        for kernel in opencl.builds(context).program(file, defines).all_kernels()
+        for kernel in build.builds(context).program(file, defines).all_kernels()
     }
     found = {one.name: len(one.arguments) for one in signatures(file)}
     assert found == built

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.phantom import Ellipsoids
+from clra.model.phantoms.ellipsoids import Ellipsoids
 
 SHAPE = (45, 53)
 

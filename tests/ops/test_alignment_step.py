@@ -6,10 +6,10 @@ import pyopencl.array as cl_array
 import pytest
 
 import clra
-from clra.model.gauge import Gauge, sample_points, without_gauge
-from clra.model.perturbation import random_motion
-from clra.model.phantom import porous
-from clra.ops.registration import ESTIMATE_FIELDS
+from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
+from clra.model.phantoms.ellipsoids import porous
+from clra.model.phantoms.perturbation import random_motion
+from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS
 
 VIEWS, SHAPE = 121, (49, 65)
 GEOMETRY = clra.circular(

@@ -15,8 +15,9 @@ import pyopencl.tools
 import pytest
 from operator_cases import CASES, WITH_SCRATCH, Case, result, values
 
-from clra.ops import fft, opencl
-from clra.ops.fft import RealFFT
+from clra.ops.filtering import fft
+from clra.ops.filtering.fft import RealFFT
+from clra.ops.runtime import build
 
 OVERHEAD = 0.2e-3  # s, of a call over the bare launch
 
@@ -61,7 +62,7 @@ def test_in_a_foreign_context_and_queue_which_it_leaves_as_they_are(case, contex
 
 @pytest.mark.parametrize("cpu", [True, False])
 def test_a_call_makes_flushes_and_finishes_no_queue(case, context, queue, monkeypatch, cpu):
-    monkeypatch.setattr(opencl, "is_cpu", lambda device: cpu)
+    monkeypatch.setattr(build, "is_cpu", lambda device: cpu)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*transforms run on the host")  # see test_every_kernel
         operator = case.run(case.make(context))
@@ -198,7 +199,7 @@ def test_a_device_that_refuses_the_work_group(case, context, queue, expected, mo
         return min(found, 4) if what == cl.kernel_work_group_info.WORK_GROUP_SIZE else found
 
     monkeypatch.setattr(cl.Kernel, "get_work_group_info", grudging)
-    monkeypatch.setattr(opencl, "is_cpu", lambda device: False)
+    monkeypatch.setattr(build, "is_cpu", lambda device: False)
     # reikna's transforms see to their groups themselves, or leave it to the host.
     monkeypatch.setattr(fft, "_backend", lambda *_: "scipy")
     found = result(case, case.make(context), queue)

@@ -12,13 +12,14 @@ from operator_cases import CASES, GRID, IMAGES, result
 
 from clra import kernels
 from clra.kernels.header import signatures
-from clra.ops import correlation, opencl
-from clra.ops.devices import choose_device
-from clra.ops.multigrid import add_update, cropped
-from clra.ops.slabs import volume_from
-from clra.ops.steps import Step
-from clra.ops.streaming import Stream
-from clra.ops.transmission import RayStatistics
+from clra.ops.registration import phase_correlation
+from clra.ops.runtime import build
+from clra.ops.runtime.devices import choose_device
+from clra.ops.runtime.kernel import Step
+from clra.ops.statistics.poisson import RayStatistics
+from clra.ops.streaming.multigrid import add_update, cropped
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume_slabs import volume_from
 
 # Where kernels may have no more than 32 work-items (Rusticl of Mesa 22) reikna gives up.
 pytestmark = pytest.mark.filterwarnings("ignore:.*transforms run on the host:UserWarning")
@@ -27,10 +28,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*transforms run on the host:Use
 @pytest.mark.parametrize("name", CASES)
 def test_forms_for_cpu_and_gpu_agree(name, context, queue, monkeypatch):
     # Phase correlation depends on what images are padded to, which is for the transform to choose.
-    monkeypatch.setattr(correlation, "fast_length", lambda context, length: 32)
+    monkeypatch.setattr(phase_correlation, "fast_length", lambda context, length: 32)
     case, found = CASES[name], []
     for cpu in (True, False):
-        monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
+        monkeypatch.setattr(build, "is_cpu", lambda device, cpu=cpu: cpu)
         found.append(result(case, case.make(context), queue))
     assert np.isfinite(found[0]).all()
     atol = case.closeness * np.abs(found[0]).max()
@@ -61,7 +62,7 @@ def test_no_kernel_is_left_out(context, queue, monkeypatch):
     monkeypatch.setattr(Step, "__call__", noted)
     with warnings.catch_warnings(record=True) as warned:
         for cpu in (True, False):
-            monkeypatch.setattr(opencl, "is_cpu", lambda device, cpu=cpu: cpu)
+            monkeypatch.setattr(build, "is_cpu", lambda device, cpu=cpu: cpu)
             for case in CASES.values():
                 result(case, case.make(context), queue)
         go_through_a_stream()

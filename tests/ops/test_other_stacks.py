@@ -8,7 +8,7 @@ import pyopencl.array as cl_array
 import pytest
 
 import clra
-from clra.ops.pyramid import Restrict2D
+from clra.ops.images.pyramid import Restrict2D
 
 GEOMETRY = clra.circular(
     5, source_to_axis=25.0, source_to_detector=50.0, pixel_size=0.3, shape=(19, 23)

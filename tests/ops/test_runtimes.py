@@ -8,7 +8,7 @@ import pyopencl as cl
 import pytest
 from operator_cases import CASES, result
 
-from clra.ops.devices import choose_device, devices
+from clra.ops.runtime.devices import choose_device, devices
 
 SAME = 1e-5  # of the largest value
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.perturbation import random_motion
-from clra.model.phantom import Ellipsoids
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.model.phantoms.perturbation import random_motion
 
 BALL = Ellipsoids([[0.1, -0.2, 0.05]], [0.45], [1.0])
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from clra.errors import ClraWarning
-from clra.ops import pocl
+from clra.ops.runtime import pocl
 
 # What /proc/cpuinfo says of a CPU for which PoCL chooses each variant, without what plays no part.
 SSE = "sse sse2 pni cx16"

@@ -1,0 +1,1 @@
+"""The commands, one concept a file."""

@@ -1,0 +1,330 @@
+"""The commands that align, correct, reconstruct and report."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from clra.app.commands.reconstruct import reconstruct
+from clra.app.console import Console, Memory, Reading, command
+
+ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
+
+
+def align(
+    console: Console,
+    reading: Reading,
+    memory: Memory,
+    scan: ScanPath,
+    out: Annotated[
+        Path, typer.Option("--output", "-o", metavar="MOTION.h5", help="Motion to write.")
+    ],
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="ra|imgr|reference",
+            help="Re-projection alignment, by itself or within a multigrid reconstruction; or only "
+            "the slow drift against a reference scan.",
+        ),
+    ] = "ra",
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="REF.nxs",
+            help="Reference scan: some views again, taken so quickly that nothing moved.",
+        ),
+    ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MOTION.h5",
+            help="Motion to start from, of a run that was interrupted or shall be refined.",
+        ),
+    ] = None,
+    autofocus: Annotated[
+        bool,
+        typer.Option(
+            "--autofocus",
+            help="First find the column of the axis and the tilt of the panel.",
+        ),
+    ] = False,
+    schedule: Annotated[
+        str,
+        typer.Option(
+            metavar="TEXT",
+            help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
+            "auto: 6ER-3QR on large panels, else QR until converged; then HR until converged. "
+            "With imgr the levels of a cycle: QR-HR-FR.",
+        ),
+    ] = "auto",
+    estimate: Annotated[
+        str,
+        typer.Option(
+            metavar="shift|shift+scale|source",
+            help="What moves in a radiograph; source: what the source causes, with parallax.",
+        ),
+    ] = "shift+scale",
+    gauge: Annotated[
+        str,
+        typer.Option(
+            metavar="anchored|free",
+            help="Take out of the motion, or leave in, what a movement of the sample explains.",
+        ),
+    ] = "anchored",
+    report: Annotated[
+        Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
+    ] = None,
+    volume: Annotated[
+        Path | None,
+        typer.Option(metavar="VOLUME", help="imgr: write its volume as well, .h5 or .tif."),
+    ] = None,
+) -> None:
+    """Estimate how each radiograph moved.
+
+    Writes shift and magnification of every view, how much to trust them, and the history of the
+    run. Ctrl-C keeps what the iterations finished so far gave.
+
+    Examples
+    --------
+      clra align scan.nxs -o motion.h5
+      clra align scan.nxs -o motion.h5 --schedule 1QR-1HR --report report.html
+      clra align scan.nxs -o finer.h5 --start motion.h5 --schedule 1HR
+      clra align scan.nxs -o motion.h5 --method imgr --volume volume.h5
+      clra align scan.nxs -o motion.h5 --reference quick.nxs
+      clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
+      clra align scan.nxs -o motion.h5 --autofocus
+    """
+    from clra.app.arguments import volume_file
+    from clra.app.exit_status import InterruptedCommandError
+    from clra.app.output_checks import focus_attributes, matched
+    from clra.app.plausible import doubt_of_turning
+    from clra.app.records import Record
+    from clra.app.report.summary import Errors, findings_of, summary_of
+    from clra.io.atomic import ensure_writable
+    from clra.io.volumes.volume_files import write_volume
+    from clra.methods.alignment.align import align as align_scan
+    from clra.methods.alignment.autofocus import autofocus as find_focus
+    from clra.methods.alignment.autofocus import sharpening_by_turning_back
+    from clra.methods.alignment.result import AlignmentInterrupted
+    from clra.model.grid import default_grid
+    from clra.model.schedule import parse_levels, parse_schedule
+
+    (parse_levels if method == "imgr" else parse_schedule)(schedule)
+    if volume is not None:
+        if method != "imgr":
+            raise ValueError(f"--volume: found it with --method {method}, expected imgr")
+        volume_file(volume)
+    if start is not None and (autofocus or reference is not None):
+        other = "--autofocus" if autofocus else "--reference"
+        raise ValueError(f"--start, {other}: found both, expected one of them")
+    limits = memory.limits()
+    ensure_writable(out, keep=(scan, reference))  # it may be --start: that is read by then
+    kept = [scan, reference, start, out]
+    for path in (report, volume):
+        if path is not None:
+            ensure_writable(path, kept)
+            kept.append(path)
+    opened = reading.scan(scan)
+    still = None if reference is None else reading.scan(reference)
+    earlier = None if start is None else Record.load(start)
+    if earlier is not None and start is not None:
+        opened = matched(opened, earlier, start, reading.geometry())
+    about = {
+        "file": str(scan.absolute()),
+        "geometry": reading.geometry(),
+        "estimate": estimate,
+        "unobservable": "taken out" if gauge == "anchored" and method != "reference" else "left in",
+        "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
+        f"--estimate {estimate} --gauge {gauge}"
+        f"{'' if reference is None else f' --reference {reference}'}"
+        f"{'' if start is None else f' --start {start}'}"
+        f"{' --autofocus' if autofocus else ''}{reading.as_typed()}",
+    }
+    with console.progress() as progress:
+        if autofocus:
+            focus = find_focus(opened, console.device, progress=progress, **limits)
+            about |= focus_attributes(focus)
+            opened = focus.applied(opened)
+            still = still and focus.applied(still)
+        try:
+            result = align_scan(
+                opened,
+                method=method,
+                schedule=schedule,
+                estimate=estimate,
+                gauge=gauge,
+                reference=still,
+                motion=None if earlier is None else earlier.motion,
+                device=console.device,
+                progress=progress,
+                **limits,
+            )
+        except AlignmentInterrupted as stopped:
+            record = Record.of(stopped.result, opened, earlier, interrupted="yes", **about)
+            record.save(out)
+            last = record.history[-1]
+            raise InterruptedCommandError(
+                f"{out} keeps what {len(record.history)} iterations gave, the last at "
+                f"{last.level}; --start {out} goes on from there"
+            ) from None
+        record = Record.of(result, opened, earlier, **about)
+        record.save(out)
+        turned = sharpening_by_turning_back(
+            opened.cropped(),
+            result.motion.about(*opened.window_aside),
+            console.device,
+            progress=progress,
+            **limits,
+        )
+        more = {"sharpening_by_turning_back": f"{turned:.3f}"}
+        record = replace(record, about={**record.about, **more})
+        record.save(out)
+        doubts = [doubt_of_turning(turned)]
+        errors = Errors.of(record, opened)
+        if volume is not None and result.volume is not None:
+            grid = default_grid(opened.cropped().geometry)
+            write_volume(volume, result.volume, grid, progress=progress)
+        if report is not None:
+            from clra.app.report.html_report import write_report
+
+            findings = findings_of(
+                record,
+                opened,
+                volume=result.volume,
+                device=console.device,
+                progress=progress,
+                **limits,
+            )
+            write_report(report, findings)
+            doubts += set(findings.notes) - set(record.notes)
+    for doubt in filter(None, doubts):
+        warnings.warn(doubt, stacklevel=1)
+    values, text = summary_of(record, errors)
+    beside = {"volume": volume, "report": report}
+    written = {"file": out, **{name: path for name, path in beside.items() if path}}
+    names = " and ".join(str(path) for path in written.values())
+    console.summary({**written, **values}, f"wrote {names}\n{text}")
+
+
+def correct(
+    console: Console,
+    reading: Reading,
+    memory: Memory,
+    scan: ScanPath,
+    motion: Annotated[
+        Path, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--output", "-o", metavar="CORRECTED.nxs", help="Scan to write.")
+    ],
+) -> None:
+    """Write a scan of corrected radiographs.
+
+    For programs that cannot take a motion: each radiograph is resampled, once. clra itself
+    reconstructs sharper from the scan as it is, with --motion. Views that the alignment flagged,
+    blank or wrong ones, keep their places in the file, but are marked invalid (image_key 3): clra
+    and other readers of NXtomo leave them out.
+
+    Examples
+    --------
+      clra correct scan.nxs --motion motion.h5 -o corrected.nxs
+    """
+    from clra.app.output_checks import motion_for, room_for
+    from clra.app.scan_description import views_flagged
+    from clra.io.scan_files import write_scan
+    from clra.methods.correction import correct as correct_scan
+
+    limits = memory.limits()
+    opened = reading.scan(scan)
+    opened, known, believed = motion_for(opened, motion, reading.geometry())
+    views, rows, columns = opened.shape
+    room_for(out, 4 * views * rows * columns, keep=(scan, motion))
+    with console.progress() as progress:
+        corrected = correct_scan(opened, known, console.device, **limits)
+        write_scan(out, corrected, believed=believed, progress=progress)
+    invalid = (~believed).nonzero()[0].tolist()
+    marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
+    console.summary(
+        {"file": out, "shape": opened.shape, "invalid": invalid},
+        f"wrote {out}: {views} corrected radiographs of {rows} x {columns}"
+        + marked * bool(invalid),
+    )
+
+
+def report(
+    console: Console,
+    reading: Reading,
+    memory: Memory,
+    motion: Annotated[Path, typer.Argument(metavar="MOTION.h5", help="Motion from clra align.")],
+    out: Annotated[
+        Path, typer.Option("--output", "-o", metavar="REPORT.html", help="Page to write.")
+    ],
+    scan: Annotated[
+        Path | None,
+        typer.Option(metavar="SCAN", help="The scan: adds slices and re-projections."),
+    ] = None,
+) -> None:
+    """Write a report of an alignment.
+
+    One HTML page that needs nothing else: corrections, convergence, confidence, and with the scan
+    slices and re-projections before and after.
+
+    Examples
+    --------
+      clra report motion.h5 -o report.html
+      clra report motion.h5 -o report.html --scan scan.nxs
+    """
+    from clra.app.output_checks import matched
+    from clra.app.records import Record
+    from clra.app.report.html_report import write_report
+    from clra.app.report.summary import findings_of
+    from clra.io.atomic import ensure_writable
+
+    limits = memory.limits()
+    record = Record.load(motion)
+    ensure_writable(out, keep=(motion, scan))
+    opened = None if scan is None else reading.scan(scan)
+    if opened is not None:
+        opened = matched(opened, record, motion, reading.geometry())
+    with console.progress() as progress:
+        findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
+    write_report(out, findings)
+    told = {} if findings.quality is None else {"quality": findings.quality}
+    console.summary({"file": out, **told}, f"wrote {out}")
+
+
+def demo(
+    console: Console,
+    out: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Where to keep the files."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Of all random numbers.", min=0)] = 0,
+) -> None:
+    """Simulate, align and reconstruct a small scan.
+
+    A space-filling scan whose radiographs jitter and drift by up to 10 pixels and grow and shrink
+    by up to 0.2 %. Takes less than a minute on a laptop without a GPU. Without --output the
+    files go to a new folder for temporary files.
+
+    Examples
+    --------
+      clra demo
+      clra demo --output demo --device nvidia
+    """
+    from clra.app.demonstration import run_demo
+
+    with console.progress() as progress:
+        shown = run_demo(out, seed=seed, device=console.device, progress=progress)
+    console.result(shown.values(), shown.text())
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    command(app, "align")(align)
+    command(app, "reconstruct")(reconstruct)
+    command(app, "correct")(correct)
+    command(app, "report")(report)
+    command(app, "demo")(demo)

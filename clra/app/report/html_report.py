@@ -1,0 +1,285 @@
+"""The report of an alignment: one HTML page that needs nothing else."""
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from clra.app.progress_bar import duration
+from clra.app.records import Record
+from clra.app.report import figures, page
+from clra.app.report.before_after import before_and_after
+from clra.app.report.summary import Errors, Findings
+from clra.app.scan_description import listed
+from clra.io.atomic import atomic_path
+from clra.methods.alignment.quality import Quality
+from clra.methods.alignment.result import Iteration
+
+_COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
+_UNOBSERVABLE = {
+    "taken out": " It was taken out of the motion.",
+    "left in": " It was left in the motion; clra align --gauge anchored takes it out.",
+}
+_RETURNS = " Errors of the stage come mirrored about the dashed line, where it turns back."
+
+
+def write_report(path: str | os.PathLike[str], findings: Findings) -> None:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : path-like
+        HTML file; appears whole or not at all.
+    findings : Findings
+        What to tell.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    text = render(findings)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def render(findings: Findings) -> str:
+    """Build the page as text.
+
+    Parameters
+    ----------
+    findings : Findings
+        What to tell.
+    """
+    record = findings.record
+    body = [
+        page.cards(_cards(findings)),
+        *(
+            [page.section("Warnings", *map(page.paragraph, findings.notes))]
+            if findings.notes
+            else []
+        ),
+        _corrections(record),
+        *([_history(record.history)] if record.history else []),
+        *([_errors(findings.errors)] if findings.errors else []),
+        *before_and_after(findings.comparison),
+        _trust(record),
+        *([_quality(findings.quality)] if findings.quality else []),
+        _settings(findings),
+    ]
+    subtitle = [f"{record.motion.views} radiographs"]
+    if record.history:
+        subtitle.append(f"aligned in {duration(sum(i.seconds for i in record.history))}")
+    if record.about.get("device"):
+        subtitle.append(f"on {record.about['device']}")
+    name = record.about.get("scan") or "a scan"
+    versions = ", ".join(f"{name} {version}" for name, version in _versions().items())
+    return page.page(f"Alignment of {name}", " ".join(subtitle), body, f"Made by {versions}.")
+
+
+def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:
+    record = findings.record
+    motion, confidence = record.motion, record.confidence
+    aside = np.abs(np.stack([motion.shift_u, motion.shift_v]))
+    median, largest = np.median(aside, axis=1), aside.max(axis=1)
+    scale = motion.magnification
+    flagged = len(record.flagged)
+    cards = [
+        ("Shift, median", f"{median[0]:.2f}, {median[1]:.2f}", "pixel", "|u|, |v|"),
+        ("Shift, largest", f"{largest[0]:.2f}, {largest[1]:.2f}", "pixel", "|u|, |v|"),
+        (
+            "Magnification",
+            f"{1e3 * (scale.min() - 1):+.2f} to {1e3 * (scale.max() - 1):+.2f}",
+            "10\u207b\u00b3",
+            "range about 1",
+        ),
+        (
+            "Confidence, median",
+            f"{np.median(confidence):.3f}",
+            "",
+            f"{flagged} of {motion.views} views flagged",
+        ),
+    ]
+    if findings.errors is not None:
+        means = findings.errors.means()
+        for name, prefix, note in (
+            ("Error, gauge-free", "gauge_free_mae", "mean |u|, |v|; below 0.5 cannot be seen"),
+            ("Error, raw", "mae", "mean |u|, |v|, with the sample's own movement"),
+        ):
+            value = f"{means[f'{prefix}_u']:.3f}, {means[f'{prefix}_v']:.3f}"
+            cards.append((name, value, "pixel", note))
+    elif record.history:
+        last = record.history[-1]
+        value = f"{last.update_u_median:.3f}, {last.update_v_median:.3f}"
+        cards.append(("Last update, median", value, "pixel", "|u|, |v|; converged below 0.1"))
+    return cards
+
+
+def _corrections(record: Record) -> str:
+    returns = record.about.get("path") == "double helix"
+    return page.section(
+        "Correction of each radiograph",
+        page.figure(
+            figures.corrections(record.motion, returns=returns),
+            "Shift (left) and magnification (right) that bring each measured radiograph back to "
+            "where the ideal geometry puts it: the inverse of the estimated motion. Positive u is "
+            "toward higher columns, positive v toward higher rows; in pixels of the full panel."
+            + (_RETURNS if returns else ""),
+            "Shift and magnification corrections against view number",
+        ),
+    )
+
+
+def _history(history: Sequence[Iteration]) -> str:
+    known = history[0].mae_u is not None
+    caption = (
+        "Left: how far each iteration still moved the radiographs (median over the views; dotted: "
+        "the farthest moved one); dashed: 0.1 pixel, below which the run counts as converged. "
+    )
+    if known:
+        caption += (
+            "Middle: mean distance to the true motion, raw and without the gauge; dashed: 0.25 "
+            "pixel. "
+        )
+    caption += (
+        "Right: what is left of the radiographs when their registered re-projections are taken "
+        "off; levels of resolution (QR, HR, FR) are not comparable with each other."
+    )
+    head = ["level", "iteration", "update u", "update v", "largest", "residual", "correlation"]
+    head += ["error u", "error v", "gauge-free u", "gauge-free v"] if known else []
+    rows = [
+        [
+            i.level,
+            str(i.iteration),
+            *(f"{x:.3f}" for x in (i.update_u_median, i.update_v_median, i.update_max)),
+            f"{i.residual:.3g}",
+            f"{i.correlation:.4f}",
+            *(
+                "" if x is None else f"{x:.3f}"
+                for x in (i.mae_u, i.mae_v, i.gauge_free_u, i.gauge_free_v)
+                if known
+            ),
+            duration(i.seconds),
+        ]
+        for i in history
+    ]
+    return page.section(
+        "Convergence",
+        page.figure(figures.convergence(history), caption, "Convergence by iteration"),
+        page.table([*head, "time"], rows),
+    )
+
+
+def _errors(errors: Errors) -> str:
+    means = errors.means()
+    names = {
+        "raw": "mae",
+        "gauge-free": "gauge_free_mae",
+        "raw, without flagged views": "believed_mae",
+        "gauge-free, without flagged views": "believed_gauge_free_mae",
+    }
+    rows = [
+        [told, *(f"{means[f'{name}_{c}']:{form}}" for c, form in _COMPONENTS.items())]
+        for told, name in names.items()
+        if f"{name}_u" in means
+    ]
+    return page.section(
+        "Error of each view",
+        page.figure(
+            figures.error_of_views(errors.raw[:, :2], errors.gauge_free[:, :2]),
+            "Estimated minus true shift (the scan is a simulation that knows its motion). Raw: as "
+            "it is. Gauge-free: without what a movement of the sample as a whole explains, which "
+            "changes where the volume lies but not how sharp it is. Shaded: half a pixel, below "
+            "which motion leaves no visible trace.",
+            "Error of the shift against view number",
+        ),
+        page.table(["mean absolute error", "u [pixel]", "v [pixel]", "magnification"], rows),
+    )
+
+
+def _trust(record: Record) -> str:
+    flagged = record.flagged
+    parts = [
+        page.figure(
+            figures.confidence(record.confidence, flagged),
+            "Correlation of each measured radiograph with its re-projection in the band of "
+            "frequencies that is registered. A flagged view fits far worse than the others; it was "
+            "given the motion of its neighbours.",
+            "Confidence against view number",
+        )
+    ]
+    if record.sigma:
+        u, v, m = record.sigma
+        parts.append(
+            page.paragraph(
+                f"Standard error of a view's registration, median: {u:.3f} pixel in u, {v:.3f} "
+                f"pixel in v, {m:.1e} in magnification."
+            )
+        )
+    if flagged:
+        parts.append(page.paragraph(f"Flagged views: {listed(flagged, 40)}."))
+    if record.gauge:
+        unobservable = record.about.get("unobservable", "")
+        parts += [
+            page.paragraph(
+                "Gauge content: root mean square of the part of the motion found that each "
+                "movement of the sample as a whole would explain. Radiographs hardly see it, and "
+                "the volume is as sharp with it as without." + _UNOBSERVABLE.get(unobservable, "")
+            ),
+            page.bars(record.gauge, "pixel"),
+        ]
+    return page.section("How far to trust it", *parts)
+
+
+def _quality(quality: Quality) -> str:
+    rows = [
+        [
+            "unexplained part of a radiograph",
+            f"{100 * quality.unexplained_before:.1f} %",
+            f"{100 * quality.unexplained_after:.1f} %",
+        ],
+        ["sharpness of the volume", "1", f"{quality.sharpness:.2f}"],
+        [
+            "disagreement of half scans, u and v [pixel]",
+            "",
+            f"{quality.half_u:.3f}, {quality.half_v:.3f}",
+        ],
+    ]
+    return page.section(
+        "What the radiographs alone tell",
+        page.table(["", "before", "after"], rows),
+        page.paragraph(
+            "Unexplained: RMS of a radiograph less its re-projection, as a part of its own "
+            "contrast in the band that is registered, median over the views. What stays after "
+            "alignment is noise and what the reconstruction cannot do. Sharpness: mean squared "
+            "gradient inside the field of view, relative to before; noise counts as sharp, too. "
+            "Half scans: every view is registered with two volumes, from the even and from the "
+            "odd views; how far they differ is how well the data hold the shifts. In simulations "
+            "it was 0.02 to 0.05 pixel with the true motion and 0.04 to 0.11 when each view was "
+            "0.25 pixel off; what both halves share, as a movement of the sample, it cannot show."
+        ),
+        page.paragraph(f"Measured with radiographs binned by {quality.level}."),
+    )
+
+
+def _settings(findings: Findings) -> str:
+    about = dict(findings.record.about)
+    command = about.pop("command", None)
+    if findings.facts:
+        about.pop("path", None)  # they tell more of it
+    about = {key: value for key, value in about.items() if value}
+    facts = {name: value.replace(" um", " \u00b5m") for name, value in findings.facts.items()}
+    tables = [page.facts(values) for values in (facts, about) if values]
+    parts = [page.columns(tables)]
+    if command:
+        parts += [page.paragraph("To do it again:"), page.code(command)]
+    return page.section("Scan, settings and how to do it again", *parts)
+
+
+def _versions() -> dict[str, str]:
+    names: Sequence[str] = ("clra", "numpy", "pyopencl")
+    found: dict[str, Any] = {name: importlib.metadata.version(name) for name in names}
+    return {**found, "Python": platform.python_version()}

@@ -1,0 +1,252 @@
+"""What there is to tell of an alignment: errors against a known truth, pictures, a summary."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.app.plausible import doubt_of_shifts
+from clra.app.progress_bar import duration
+from clra.app.records import Record
+from clra.app.scan_description import Facts, table, views_flagged
+from clra.model.gauge.gauge import Gauge, sample_points
+from clra.model.grid import default_grid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+
+if TYPE_CHECKING:
+    from clra.app.report.comparison import Comparison
+    from clra.methods.alignment.quality import Quality
+    from clra.ops.streaming.stream import Report
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What an estimate lacks to the truth, view by view.
+
+    Attributes
+    ----------
+    raw, gauge_free : ndarray, (views, 3)
+        Estimate minus truth along u and v [pixel] and in magnification, as it is and without what
+        a movement of the sample as a whole explains.
+    believed : ndarray of bool, (views,)
+        Views that were not flagged: the others' errors are those of a guess.
+    """
+
+    raw: Floats
+    gauge_free: Floats
+    believed: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, record: Record, scan: Scan) -> "Errors | None":
+        """Compare an estimate with the truth, if the scan knows it.
+
+        Parameters
+        ----------
+        record : Record
+            Of an alignment of the scan.
+        scan : Scan
+            With its geometry, and its truth if it is a simulation.
+        """
+        if scan.truth is None:
+            return None
+        motion, truth = record.motion, scan.truth
+        difference = Motion(
+            shift_u=motion.shift_u - truth.shift_u,
+            shift_v=motion.shift_v - truth.shift_v,
+            magnification=1 + (motion.magnification - truth.magnification),
+        )
+        points = sample_points(default_grid(scan.geometry))
+        fit = Gauge(scan.geometry, points, magnification=record.scale_estimated).fit(difference)
+        return cls(fit.part + fit.remainder, fit.remainder, record.believed)
+
+    def means(self) -> dict[str, float]:
+        """Mean absolute errors by name; those of believed views where some are not."""
+        errors = {"mae": self.raw, "gauge_free_mae": self.gauge_free}
+        if not self.believed.all():
+            errors |= {f"believed_{name}": of[self.believed] for name, of in errors.items()}
+        components = ("u", "v", "magnification")
+        return {
+            f"{name}_{component}": float(mean)
+            for name, of in errors.items()
+            for component, mean in zip(components, np.abs(of).mean(axis=0), strict=True)
+        }
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a report tells of.
+
+    Attributes
+    ----------
+    record : Record
+        Of the alignment.
+    errors : Errors, optional
+        Where the truth is known.
+    comparison : Comparison, optional
+        Pictures, where the scan was at hand.
+    facts : mapping of str to str
+        Of the scan, for reading.
+    quality : Quality, optional
+        What the radiographs alone tell, where the scan was at hand.
+    """
+
+    record: Record
+    errors: Errors | None = None
+    comparison: "Comparison | None" = None
+    facts: Mapping[str, str] = field(default_factory=dict)
+    quality: "Quality | None" = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the run warned of, and what the scan itself tells against its result."""
+        doubt = "" if self.quality is None else doubt_of_shifts(self.quality, self.record.motion)
+        return (*self.record.notes, doubt) if doubt else self.record.notes
+
+
+def findings_of(
+    record: Record,
+    scan: Scan | None,
+    *,
+    volume: NDArray[np.float32] | None = None,
+    device: Any = None,
+    progress: "Report | None" = None,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
+) -> Findings:
+    """Collect what a report needs; with the scan, reconstruct it before and after.
+
+    Parameters
+    ----------
+    record : Record
+        Of the alignment.
+    scan : Scan, optional
+        The one that was aligned.
+    volume : ndarray, (nz, ny, nx), optional
+        By multigrid iteration, aligned: it is shown beside one that was not.
+    device : str or cl.Device, optional
+        Where to reconstruct.
+    progress : callable, optional
+        Told how far it is.
+    max_device_memory, max_host_memory : int, optional
+        Bytes that may be used.
+    """
+    if scan is None:
+        return Findings(record)
+    from clra.app.report.comparison import compare, volume_level
+    from clra.methods.alignment.quality import quality
+    from clra.ops.streaming.stream import Stream
+
+    stream = Stream(
+        device,
+        max_device_memory=max_device_memory,
+        max_host_memory=max_host_memory,
+        report=progress,
+    )
+    part = scan.cropped()
+    motion = record.motion.about(*scan.window_aside)
+    return Findings(
+        record,
+        errors=Errors.of(record, scan),
+        comparison=compare(stream, part, motion, record.confidence, record.believed, volume),
+        quality=quality(stream, part, motion, volume_level(part), record.believed)
+        if _in_both_halves(record.believed)
+        else None,
+        facts=Facts.of(scan).lines(),
+    )
+
+
+def _in_both_halves(believed: NDArray[np.bool_]) -> bool:
+    """Whether two of the even views and two of the odd ones are left to compare."""
+    return bool(believed[::2].sum() > 1 and believed[1::2].sum() > 1)
+
+
+def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], str]:
+    """Sum an alignment up.
+
+    Parameters
+    ----------
+    record : Record
+        Of the alignment.
+    errors : Errors, optional
+        Where the truth is known.
+
+    Returns
+    -------
+    values : dict
+        For programs.
+    text : str
+        For people.
+    """
+    motion, confidence = record.motion, record.confidence
+    aside = np.abs(np.stack([motion.shift_u, motion.shift_v]))
+    (median_u, median_v), (largest_u, largest_v) = np.median(aside, axis=1), aside.max(axis=1)
+    least, most = motion.magnification.min(), motion.magnification.max()
+    seconds = sum(iteration.seconds for iteration in record.history)
+    values = {
+        "views": motion.views,
+        "median_shift": [median_u, median_v],
+        "largest_shift": [largest_u, largest_v],
+        "magnification": [least, most],
+        "confidence_median": np.median(confidence),
+        "flagged": record.flagged,
+        "gauge": record.gauge,
+        "schedule": record.about.get("schedule", ""),
+        "device": record.about.get("device", ""),
+        "seconds": seconds,
+        "history": record.history,
+        **(errors.means() if errors else {}),
+    }
+    lines = {
+        "run": f"{motion.views} views, {_levels(record)}, {duration(seconds)}",
+        "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
+        f"largest {largest_u:.2f}, {largest_v:.2f}",
+        "magnification": f"{least:.5f} to {most:.5f}",
+        "confidence": f"median {np.median(confidence):.3f}, {views_flagged(record.flagged)}",
+    }
+    if record.gauge:
+        lines["unobservable"] = _unobservable(record)
+    if "panel_offset_u" in record.about:
+        offset, tilt = (record.about[name] for name in ("panel_offset_u", "panel_tilt"))
+        values |= {"panel_offset_u": offset, "panel_tilt": tilt}
+        lines["panel"] = (
+            f"axis {offset} aside, image turned by {tilt}; slices sharper by a factor of "
+            f"{record.about.get('panel_sharpening', '?')}"
+        )
+    if "source_travel" in record.about:
+        values["source_travel"] = lines["source"] = record.about["source_travel"]
+    if errors:
+        means = errors.means()
+        lines["error"] = _error(means, "", record)
+        if record.flagged:
+            lines["not flagged"] = _error(means, "believed_", record)
+    return values, table(lines)
+
+
+def _unobservable(record: Record) -> str:
+    """Tell the gauge by mode, the largest first, as far as it can be seen."""
+    parts = sorted(record.gauge.items(), key=lambda mode: -mode[1])
+    what = record.about.get("unobservable")
+    told = ", ".join(f"{name} {size:.2f}" for name, size in parts if size >= 0.005)
+    return f"{told or 'below 0.01'} pixel rms" + (f", {what}" if what else "")
+
+
+def _error(means: Mapping[str, float], which: str, record: Record) -> str:
+    raw, free = (
+        f"{means[f'{which}{name}_u']:.3f}, {means[f'{which}{name}_v']:.3f}"
+        for name in ("mae", "gauge_free_mae")
+    )
+    scale = f"; magnification {means[f'{which}mae_magnification']:.1e}"
+    return f"mean {raw} pixel along u, v against the truth; gauge-free {free}" + (
+        scale if record.scale_estimated else ""
+    )
+
+
+def _levels(record: Record) -> str:
+    """Count the iterations at each level: "4QR-1HR"."""
+    levels = [iteration.level for iteration in record.history]
+    return "-".join(f"{levels.count(level)}{level}" for level in dict.fromkeys(levels))

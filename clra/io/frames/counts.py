@@ -1,0 +1,212 @@
+"""Radiographs read when asked for: counts in, transmission out."""
+
+from __future__ import annotations
+
+import warnings
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.errors import InputError
+from clra.model.bad_pixels import Patches
+
+Floats = NDArray[np.float32]
+Frames = NDArray[np.intp]
+
+# A frame with more saturated pixels than this part of it is refused. Below, the saturated pixels
+# are hot ones or the edge of a beam; above, the sample itself has lost its contrast somewhere.
+_SATURATED = 0.01
+# Flats that are not above the dark in more than this part of the panel are no flats.
+_DEAD = 0.5
+
+
+class Radiographs:
+    """Transmission (views, rows, columns) of a scan, computed from counts as it is sliced.
+
+    ``(counts - dark) / (flat - dark)``, with the mean of the dark frames and a flat that runs
+    linearly from one group of consecutive flat frames to the next by the number of the frame. Where
+    a flat is not above the dark the pixel is dead: it gets the median of its good neighbours.
+
+    Parameters
+    ----------
+    frames : HDF5 data set or array, (frames, rows, columns)
+        Everything that the detector wrote.
+    path : str
+        Its file, for messages.
+    views, flats, darks : ndarray of int
+        Which frames are radiographs, flat fields and dark fields.
+    white : float, optional
+        Counts of the open beam, in place of the flat frames.
+    normalised : bool
+        The frames hold transmission or line integrals already: they are only checked.
+    saturation : float, optional
+        Counts at which the detector saturates; by default the largest of an integer type.
+
+    Attributes
+    ----------
+    shape : (int, int, int)
+        Views, rows, columns.
+    dtype : dtype
+        float32.
+    notes : tuple of str
+        What was noticed: for users.
+    mask : ndarray of bool, (rows, columns), or None
+        False where dead pixels stand so close together that their values are far-fetched.
+
+    Raises
+    ------
+    InputError
+        If there is neither flat nor `white`, or flats do not stand above the darks. On slicing:
+        if a frame cannot be read, has pixels that are no finite numbers, or is saturated.
+    """
+
+    def __init__(
+        self,
+        frames: Any,
+        *,
+        path: str,
+        views: Frames,
+        flats: Frames,
+        darks: Frames,
+        white: float | None = None,
+        normalised: bool = False,
+        saturation: float | None = None,
+    ) -> None:
+        self._frames = frames
+        self._path = path
+        self._field = str(getattr(frames, "name", "frames"))
+        self._views = views
+        self._warned = False
+        self._saturation = saturation
+        if saturation is None and frames.dtype.kind in "iu":
+            self._saturation = float(np.iinfo(frames.dtype).max)
+        self.shape = (len(views), int(frames.shape[1]), int(frames.shape[2]))
+        self.dtype = np.dtype(np.float32)
+        self.notes: tuple[str, ...] = ()
+        self.mask: NDArray[np.bool_] | None = None
+        self._flats: list[Floats] = []
+        if not normalised:
+            self._prepare(flats, darks, white)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return self.shape[0]
+
+    def __getitem__(self, index: Any) -> Floats:
+        """Read some views: a slice, a number, numbers or a mask (views,)."""
+        frames = self._views[index]
+        chosen = np.atleast_1d(frames)
+        out = np.empty((len(chosen), *self.shape[1:]), np.float32)
+        for start, stop in _runs(chosen):
+            counts = self._read(int(chosen[start]), stop - start)
+            self._check_saturation(counts, int(chosen[start]))
+            out[start:stop] = counts
+        for frame, image in zip(chosen, out, strict=True):
+            self._normalise(int(frame), image)
+        return out if np.ndim(frames) else out[0]
+
+    def _prepare(self, flats: Frames, darks: Frames, white: float | None) -> None:
+        """Average darks and flats and find the dead pixels."""
+        if white is None and not len(flats):
+            raise InputError.at(
+                self._path, "image_key", "no flat frame (image_key 1)",
+                "at least one, or the counts of the open beam: white= / --white "
+                "(1 for radiographs that are normalised already)",
+            )  # fmt: skip
+        panel = self.shape[1:]
+        self._dark = self._mean(darks) if len(darks) else np.zeros(panel, np.float32)
+        if not len(darks):
+            self._note("no dark frame: 0 counts taken as dark")
+        if white is None:
+            groups = [flats[start:stop] for start, stop in _runs(flats)]
+        else:
+            groups = []
+            self._flats.append(np.full(panel, white, np.float32) - self._dark)
+        self._positions = np.array([float(group.mean()) for group in groups] or [0.0])
+        self._flats += [self._mean(group, flat=True) - self._dark for group in groups]
+        dead = np.any([flat <= 0 for flat in self._flats], axis=0)
+        if dead.mean() > _DEAD:
+            raise InputError.at(
+                self._path, self._field,
+                f"flats that are not above the darks in {int(dead.sum())} of {dead.size} pixels",
+                "flats brighter than darks: image_key 1 is flat, 2 is dark",
+            )  # fmt: skip
+        for flat in self._flats:
+            flat[dead] = 1.0
+        self._patches = Patches(dead)
+        if dead.any():
+            self._note(f"{int(dead.sum())} dead pixels (flat not above dark) filled from beside")
+        if self._patches.far.any():
+            self.mask = ~self._patches.far
+
+    def _note(self, text: str) -> None:
+        self.notes = (*self.notes, text)
+
+    def _normalise(self, frame: int, image: Floats) -> None:
+        """Turn the counts of one frame into transmission, in place."""
+        if not self._flats:
+            return
+        right = int(np.searchsorted(self._positions, frame))
+        image -= self._dark
+        if right in (0, len(self._positions)):
+            image /= self._flats[min(right, len(self._flats) - 1)]
+        else:
+            before, after = self._positions[right - 1 : right + 1]
+            weight = np.float32((frame - before) / (after - before))
+            image /= (1 - weight) * self._flats[right - 1] + weight * self._flats[right]
+        self._patches.fill(image)
+
+    def _mean(self, frames: Frames, *, flat: bool = False) -> Floats:
+        """Mean of some frames, read one by one."""
+        total = np.zeros(self.shape[1:], np.float64)
+        for frame in frames:
+            counts = self._read(int(frame), 1)
+            if flat:
+                self._check_saturation(counts, int(frame))
+            total += counts[0]
+        return np.asarray(total / len(frames), np.float32)
+
+    def _read(self, start: int, count: int) -> NDArray[Any]:
+        """Read consecutive frames as they are; refuse pixels that are no finite numbers."""
+        try:
+            counts = np.asarray(self._frames[start : start + count])
+        except (OSError, RuntimeError) as error:
+            raise InputError.at(
+                self._path, self._field, f"frames {start} to {start + count - 1}: {error}",
+                "readable frames",
+            ) from error  # fmt: skip
+        if counts.dtype.kind == "f":
+            bad = np.count_nonzero(~np.isfinite(counts), axis=(1, 2))
+            if bad.any():
+                first = int(np.argmax(bad > 0))
+                raise InputError.at(
+                    self._path, self._field,
+                    f"frame {start + first} with {bad[first]} pixels that are no finite numbers",
+                    "finite numbers",
+                )  # fmt: skip
+        return counts
+
+    def _check_saturation(self, counts: NDArray[Any], start: int) -> None:
+        """Refuse frames that are saturated; warn once of a few saturated pixels."""
+        if self._saturation is None:
+            return
+        full = np.count_nonzero(counts >= self._saturation, axis=(1, 2))
+        worst = int(np.argmax(full))
+        found = f"frame {start + worst} with {full[worst]} pixels at {self._saturation:g} counts"
+        if full[worst] > _SATURATED * counts[0].size:
+            raise InputError.at(
+                self._path, self._field, found,
+                f"at most {_SATURATED:.0%} of the pixels saturated",
+            )  # fmt: skip
+        if full[worst] and not self._warned:
+            self._warned = True
+            warnings.warn(f"{self._path}: {self._field}: {found}: saturated", stacklevel=4)
+
+
+def _runs(frames: Frames) -> list[tuple[int, int]]:
+    """Ranges of `frames` in which they are consecutive, so that each is one read."""
+    breaks = np.flatnonzero(np.diff(frames) != 1) + 1
+    edges = [0, *breaks.tolist(), len(frames)] if len(frames) else [0]
+    return list(pairwise(edges))

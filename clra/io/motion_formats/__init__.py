@@ -1,0 +1,1 @@
+"""Geometries and motions in other programs' formats."""

@@ -1,0 +1,1 @@
+"""NXtomo files, read and written."""

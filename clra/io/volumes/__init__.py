@@ -1,0 +1,1 @@
+"""Volume files: HDF5 and TIFF."""

@@ -1,0 +1,1 @@
+"""Re-projection alignment (Algorithms 1 and 2 of the paper)."""

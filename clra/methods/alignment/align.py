@@ -1,0 +1,178 @@
+"""Find out how each radiograph moved: the choice of method, options and what they go with."""
+
+from dataclasses import replace
+from typing import Any
+
+from clra.methods.alignment.coarse_to_fine import CoarseToFine
+from clra.methods.alignment.options import Solver
+from clra.methods.alignment.reference_scan import align_to_reference
+from clra.methods.alignment.reprojection import with_margin
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.reconstruction.imgr import imgr
+from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.model.grid import VolumeGrid, default_grid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+from clra.model.schedule import parse_schedule
+from clra.ops.streaming.stream import Report, Stream
+
+METHODS = ("ra", "imgr", "reference")
+ESTIMATES = ("shift", "shift+scale", "source")
+GAUGES = ("anchored", "free")
+
+
+def align(
+    scan: Scan,
+    method: str = "ra",
+    schedule: str = "auto",
+    estimate: str = "shift+scale",
+    grid: VolumeGrid | None = None,
+    device: Any = None,
+    *,
+    reference: Scan | None = None,
+    motion: Motion | None = None,
+    truth: Motion | None = None,
+    progress: Report | None = None,
+    gauge: str = "anchored",
+    solver: Solver | None = None,
+    max_device_memory: int | None = None,
+    max_host_memory: int | None = None,
+) -> AlignmentResult:
+    """Estimate how each radiograph moved.
+
+    Parameters
+    ----------
+    scan : Scan
+        At least two views.
+    method : {"ra", "imgr", "reference"}
+        Re-projection alignment before reconstruction; or within one by multigrid iteration
+        (`imgr`, Algorithm 3), which returns the volume as well; or the slow
+        drift against a reference scan alone, without any reconstruction.
+    schedule : str
+        Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
+        panel of 384 pixels and more "6ER-3QR", else a quarter of the resolution until converged (at
+        most 20 iterations), then half until converged (at most 3, often one). For "imgr" the levels
+        of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
+    estimate : {"shift+scale", "shift", "source"}
+        Whether the magnification of each view is estimated or taken as 1; or whether it is the
+        source that moved, in all three directions: this explains the parallax by which what is
+        near the source shifts farther than what is far from it, too.
+    grid : VolumeGrid, optional
+        Full-resolution grid that holds the sample; by default the whole field of view.
+    device : str or cl.Device, optional
+        As :func:`clra.ops.runtime.devices.choose_device` takes it.
+    reference : Scan, optional
+        Some views of the scan again, from the same places, taken so quickly that nothing moved.
+        What drifted slowly against them is where re-projection alignment starts.
+    motion : Motion, optional
+        Where to start; by default no motion. What it has of the gauge stays.
+    truth : Motion, optional
+        To report errors against; by default the scan's own, if it is a simulated one.
+    progress : callable, optional
+        Called with a :class:`clra.ops.streaming.stream.Progress` as work goes on.
+    gauge : {"anchored", "free"}
+        What becomes of the part of the motion that a movement of the sample as a whole (three
+        translations, two tilts, a stretch along z) would explain as well. The data hardly see it,
+        and what the iteration finds of it comes from how a cone beam reconstructs the ends of a
+        scan: it would go on and stretch the sample. "anchored" takes it out in each iteration.
+    solver : Solver, optional
+        Parts of the iteration, to switch some off.
+    max_device_memory, max_host_memory : int, optional
+        Bytes that may be used.
+
+    Returns
+    -------
+    AlignmentResult
+
+    Raises
+    ------
+    ValueError
+        If an option is none of its choices or the scan has less than two views.
+    AlignmentInterrupted
+        On Ctrl-C after at least one iteration; carries the result so far.
+
+    References
+    ----------
+    .. [1] "Multi-resolution radiograph alignment for motion correction in X-ray micro-tomography",
+       Algorithms 1, 2 and 3.
+    """
+    _check(scan, method, estimate, gauge)
+    for name, given in (("motion", motion), ("truth", truth)):
+        if given is not None and given.views != scan.views:
+            raise ValueError(f"{name}: found {given.views} views, expected {scan.views}")
+    if (method == "reference" and reference is None) or (reference and motion):
+        found = "both" if motion else "none with method='reference'"
+        raise ValueError(f"reference, motion: found {found}, expected one of them")
+    # What the mask leaves of the panel is aligned as a panel of its own.
+    whole, scan = scan, scan.cropped()
+    aside = whole.window_aside
+    stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
+    stream = Stream(
+        device,
+        max_device_memory=max_device_memory,
+        max_host_memory=max_host_memory,
+        report=progress,
+    )
+    truth = scan.truth if truth is None else truth.about(*aside)
+    motion = None if motion is None else motion.about(*aside)
+    if reference is not None:
+        if reference.geometry.shape == whole.geometry.shape:
+            reference = replace(reference, mask=whole.mask).cropped()
+        drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
+        if method == "reference":
+            return _on_panel(drift, whole)
+        motion = drift.motion
+    grid = grid or default_grid(scan.geometry)
+    solver, anchor = solver or Solver(), gauge == "anchored"
+    scale = estimate != "shift" and solver.estimator == "gauss-newton"
+    start = motion or Motion.identity(scan.views)
+    start = start.caused_by("source" if estimate == "source" else "panel")
+    try:
+        if method == "imgr":
+            solved = _by_imgr(
+                stream,
+                scan,
+                grid,
+                levels=schedule,
+                align=True,
+                scale=scale,
+                anchor=anchor,
+                motion=start,
+                truth=truth,
+            )
+            return _on_panel(solved, whole)
+        run = CoarseToFine(
+            stream, scan, with_margin(grid), schedule, scale, anchor, solver, start, truth
+        )
+        run.align(stages)
+    except AlignmentInterrupted as stopped:
+        raise AlignmentInterrupted(_on_panel(stopped.result, whole)) from None
+    return _on_panel(run.result(), whole)
+
+
+def _on_panel(result: AlignmentResult, scan: Scan) -> AlignmentResult:
+    """Return a result for what the mask leaves as one for the whole panel."""
+    aside_u, aside_v = scan.window_aside
+    return replace(result, motion=result.motion.about(-aside_u, -aside_v))
+
+
+def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:
+    """Algorithm 3."""
+    try:
+        found = imgr(stream, scan, grid, **options)
+    except ReconstructionInterrupted as stopped:
+        assert stopped.alignment is not None  # each level registers
+        raise AlignmentInterrupted(stopped.alignment) from None
+    assert found.alignment is not None
+    return replace(found.alignment, volume=found.volume.to_host())
+
+
+def _check(scan: Scan, method: str, estimate: str, gauge: str) -> None:
+    if method not in METHODS:
+        raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
+    if estimate not in ESTIMATES:
+        raise ValueError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
+    if gauge not in GAUGES:
+        raise ValueError(f"gauge: found {gauge!r}, expected one of {GAUGES}")
+    if scan.views < 2:
+        raise ValueError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")

@@ -1,0 +1,204 @@
+"""Re-projection alignment from coarse to fine: Algorithms 1 and 2 of the paper.
+
+Reconstruct from the radiographs as they are, project the volume forward, register each measured
+radiograph with its simulated twin, correct, repeat; first at a quarter of the resolution, then at
+half. The correction is absorbed into the geometry: no radiograph is resampled, and the simulated
+ones come out in the frame of the measured ones, so that what registration finds is what is left.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.alignment.acceleration import MotionSteps
+from clra.methods.alignment.level import Level
+from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
+from clra.methods.alignment.options import Solver
+from clra.methods.alignment.rejected_views import from_neighbours, odd_radiographs, outliers
+from clra.methods.alignment.reprojection import Registered
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration
+from clra.model.gauge.gauge import Gauge, sample_points
+from clra.model.grid import VolumeGrid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+from clra.model.schedule import Stage, converged, level_name, update_size
+from clra.ops.streaming.stream import Stream
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class CoarseToFine:
+    """One alignment, and what its levels hand on.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        At full resolution.
+    grid : VolumeGrid
+        At full resolution, with the margin that views at the ends of a scan look through.
+    schedule : str
+        As it was written, for the result.
+    scale : bool
+        Whether to estimate magnifications.
+    anchor : bool
+        Whether to take the gauge out of the motion in each iteration.
+    solver : Solver
+        Parts of the iteration.
+    start : Motion
+        Where to start.
+    truth : Motion, optional
+        To report errors against.
+    """
+
+    stream: Stream
+    scan: Scan
+    grid: VolumeGrid
+    schedule: str
+    scale: bool
+    anchor: bool
+    solver: Solver
+    start: Motion
+    truth: Motion | None = None
+    several: bool = field(init=False)  # iterations in the schedule
+    motion: Motion = field(init=False)
+    history: list[Iteration] = field(init=False, default_factory=list)
+    registered: Registered = field(init=False)
+    found: Motion = field(init=False)  # by the last iteration, with its gauge
+    last: tuple[int, Floats] = field(init=False)  # its level, and updates of views believed
+    fresh: bool = field(init=False)  # nothing was known of the motion before it
+    steps: MotionSteps = field(init=False)  # of the level
+    weak: NDArray[np.bool_] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.motion = self.start
+        points = sample_points(self.grid)
+        self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
+        # Taken out of the shifts alone: to fit them a little better, the joint fit would take
+        # magnifications of several per cent.
+        self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
+
+    def align(self, stages: Sequence[Stage]) -> None:
+        """Go through the levels; what an interruption leaves is kept."""
+        self.several = sum(stage.limit for stage in stages) > 1
+        try:
+            for stage in stages:
+                self.align_level(stage)
+        except KeyboardInterrupt:
+            if not self.history:
+                raise
+            raise AlignmentInterrupted(self.result()) from None
+
+    def align_level(self, stage: Stage) -> None:
+        """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level)."""
+        name = level_name(stage.level)
+        # 1, 7: down-sample the measured radiographs
+        level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
+        if not self.history:
+            self.weak = odd_radiographs(self.stream, level.radiographs)
+        # Each level ends a little aside of the one before: extrapolated by the last, short steps of
+        # that one, its first steps would go astray.
+        steps = self.solver.acceleration()
+        self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
+        previous = None
+        for iteration in range(1, (stage.iterations or stage.limit) + 1):
+            started = time.perf_counter()
+            of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
+            found = self._iterate(level, title=of)
+            wrong = outliers(found.correlation) & ~self.weak
+            if not self.history and wrong.any():
+                # They were in the first volume: again without, or what they did to the others stays
+                # in the modes that data hardly see, a tenth of all that is left of random motion.
+                self.weak, level.bias = self.weak | wrong, None
+                found = self._iterate(level, title=of)
+            step, note = self._move(found, stage.level)
+            update = np.abs(step)
+            self.history.append(
+                Iteration.of(
+                    name,
+                    iteration,
+                    update,
+                    found.correlation,
+                    found.residual,
+                    time.perf_counter() - started,
+                    note=note,
+                    **self._errors(),
+                )
+            )
+            # 6, 13: until converged, whatever becomes of views that are not believed
+            update_u, update_v = update[:, ~self.weak]
+            if stage.iterations is None and converged(
+                update_u, update_v, previous, stage.tolerance
+            ):
+                break
+            # A first step finds too little, see `_move`: the second may well find as much.
+            previous = None if self.fresh else update_size(update_u, update_v)[0]
+        if len({entry.level for entry in self.history}) == 1:
+            note = warned(lost_features(self.scan, found.correlation, stage.level))
+            notes = filter(None, (self.history[-1].note, note))
+            self.history[-1] = replace(self.history[-1], note="\n".join(notes))
+
+    def _iterate(self, level: Level, *, title: str) -> Registered:
+        """Algorithm 1, steps 2 to 4."""
+        first = not self.history
+        shifts_only = first and self._shifts_first
+        return level.residual_motion(
+            self.motion,
+            self.motion.magnification / self.start.magnification,
+            believed=~self.weak,
+            first=first,
+            magnification=self.scale and not shifts_only,
+            measure=not shifts_only,
+            title=title,
+        )
+
+    def _move(self, found: Registered, level: int) -> tuple[Floats, str]:
+        """Algorithm 1, step 5: append what was found.
+
+        Returns the plain step in u and v, and what was warned of.
+        """
+        self.registered = found
+        self.weak = outliers(found.correlation)
+        self.found = from_neighbours(self.motion.then(found.motion), self.weak).normalised()
+        there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
+        step = self.steps.step(self.motion, there)
+        believed = np.abs(step[:, ~self.weak])
+        if self.history:
+            note = warned(false_shifts(*self.last, level, believed))
+            self.fresh = bool(note)
+        else:
+            note = warned(far_motion(found.motion, level))
+            self.fresh = True
+        self.last = level, believed
+        # A first step's reconstruction was blurred, and what it registered is not all that later
+        # ones do: nothing to extrapolate from.
+        self.motion = self.steps.next(self.motion, there, plain=self.fresh)
+        return step, note
+
+    @property
+    def _shifts_first(self) -> bool:
+        """Whether the magnification waits: others follow, and none is known already."""
+        known = bool((self.start.magnification != 1).any())
+        return self.solver.shifts_first and self.several and not known
+
+    def _errors(self) -> dict[str, float]:
+        if self.truth is None:
+            return {}
+        return self.gauge.error(self.motion, self.truth).means()
+
+    def result(self) -> AlignmentResult:
+        """Return what the iterations so far gave."""
+        return AlignmentResult.of(
+            self.motion,
+            self.history,
+            self.registered,
+            self.weak,
+            self.gauge.fit(self.found),
+            self.schedule,
+            self.stream.device.name,
+        )

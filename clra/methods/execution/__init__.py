@@ -1,0 +1,1 @@
+"""Who executes: one device, or several."""

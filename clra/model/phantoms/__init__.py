@@ -1,0 +1,1 @@
+"""Phantoms whose line integrals have a closed form, and motions to simulate."""

@@ -1,0 +1,1 @@
+"""Filters of radiographs for filtered back-projection, and Fourier transforms."""

@@ -1,0 +1,296 @@
+"""Ramp filter of radiographs, for filtered back-projection along any trajectory."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import ArrayLike, NDArray
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.ops.filtering.fft import RealFFT, fast_length
+from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
+from clra.ops.runtime import build
+from clra.ops.runtime.buffers import Allocator, Scratch, within
+from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.lines import lanes
+
+WINDOWS = ("ram-lak", "shepp-logan", "hann")
+
+# Part of the rows at the top and at the bottom over which a view fades out. Without it the border
+# of each panel leaves an edge in the volume; a tenth smooths it and costs few rays.
+FADE = 0.1
+
+# Bytes of padded lines in work at a time. A CPU wants them in its cache between the steps (2 to 64
+# MiB differ by 10 % on two cores); a GPU wants enough of them to fill it, and its transform takes
+# three times as much again.
+_CPU_BYTES = 8 << 20
+_GPU_BYTES = 16 << 20
+
+# Some drivers take no more than 65535 work-groups along a range's second and third axes.
+_MOST_LINES = 1 << 15
+
+# Part of the columns over which `extend` continues a truncated row on each side.
+_EXTENSION = 0.2
+
+
+def taper(rows: int, fraction: float) -> NDArray[np.float32]:
+    """Weights of detector rows that fall off towards the top and the bottom of the panel.
+
+    They keep the borders of cone-beam data, where views end abruptly, from showing in a
+    reconstruction that is divided by the summed weights.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of the panel.
+    fraction : float
+        Part of the rows, at each end, over which the weight falls as a squared cosine; 0 to 0.5.
+
+    Returns
+    -------
+    ndarray, (rows,)
+        float32, symmetric, above 0, at most 1.
+
+    Raises
+    ------
+    ValueError
+        If the fraction is out of range.
+    """
+    if not 0 <= fraction <= 0.5:
+        raise ValueError(f"fraction: found {fraction}, expected 0 to 0.5")
+    row = np.arange(rows)
+    depth = np.minimum(row, rows - 1 - row) + 0.5
+    roll = np.minimum(1.0, depth / max(fraction * rows, 0.5))
+    return (np.sin(np.pi / 2 * roll) ** 2).astype(np.float32)
+
+
+class RampFilter:
+    """Cosine weight, ramp filter along u, and the scale that back-projection needs.
+
+    Of radiographs p of line integrals it makes ``q = R / (SDD |u'|) (p w r) * h`` with R the
+    distance from source to axis, SDD that to the panel, u' what of u is across the way to the axis
+    (all of it, if the panel faces the axis), w SDD over the length of the ray, r the row and view
+    weights, and h the band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd n, 0 for
+    even n. With
+    depth fractions g(x) and summed row weights W(x) the attenuation is then
+    ``f(x) = pi / W(x) sum_i q_i(x) / g_i(x)^2`` for views around the whole circle. [1]_
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where the arrays live.
+    geometry : ConeBeamGeometry
+        Of all views.
+    row_weight : array_like, optional
+        (rows,) weights of the detector's rows, see :func:`taper`; 1 by default.
+    view_weight : array_like, optional
+        (views,) weights of the radiographs as a whole; 1 by default.
+    window : {"ram-lak", "shepp-logan", "hann"}
+        What the ramp's spectrum is multiplied by: nothing, a sinc, or a raised cosine that is 0 at
+        the Nyquist frequency.
+    extend : bool
+        Continue each row past the panel, a fifth of its length on each side, from its outermost
+        value to 0 as a squared cosine: for samples that are wider than the panel.
+    backend : {"scipy", "reikna"}, optional
+        As for :class:`clra.ops.filtering.fft.RealFFT`; with "scipy" a call blocks the host.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch: fewer lines are treated at a time.
+
+    Attributes
+    ----------
+    window : str
+        As given.
+    padded : int
+        Columns of a line in the transforms, at least twice those of the panel.
+    scratch_bytes : int
+        Of scratch memory.
+
+    Raises
+    ------
+    ValueError
+        If an argument is none of the above.
+
+    References
+    ----------
+    .. [1] A. C. Kak and M. Slaney, "Principles of Computerized Tomographic Imaging", IEEE Press,
+       1988, sections 3.3.3 and 3.6.2.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        *,
+        row_weight: ArrayLike | None = None,
+        view_weight: ArrayLike | None = None,
+        window: str = "ram-lak",
+        extend: bool = False,
+        backend: str | None = None,
+        allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
+    ) -> None:
+        if window not in WINDOWS:
+            raise ValueError(f"window: found {window!r}, expected one of {', '.join(WINDOWS)}")
+        self.window = window
+        self._context = context
+        self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
+        margin = math.ceil(_EXTENSION * self._columns) if extend else 0
+        self.padded = fast_length(context, 2 * (self._columns + margin), backend)
+        cpu = build.is_cpu(build.device_of(context))
+        self._lanes = lanes(context)
+        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)
+        lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
+        memory = Scratch(context, allocator)
+        self._lines = memory.empty(lines)
+        self._fft = RealFFT(context, lines, (2,), backend, allocator=memory)
+        self.scratch_bytes = self._lines.nbytes + self._fft.scratch_bytes
+        defines = {"LANES": self._lanes}
+        self._weight = Step(context, "ramp.cl", "weight_lines", (64, 2), defines)
+        self._cut = Step(context, "ramp.cl", "cut_lines", (64, 2), defines)
+        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
+        self._view_weight = view_weights(view_weight, self._views)
+        self._roll = to_device(context, _roll(self.padded - self._columns, margin))
+        self._ramp = to_device(context, _ramp_spectrum(self.padded, window))
+        self._last: list[cl.Event] = []
+        self.set_geometry(geometry)
+
+    def set_geometry(self, geometry: ConeBeamGeometry) -> None:
+        """Take a geometry of the same views and shape, for example with another motion.
+
+        Raises
+        ------
+        ValueError
+            If views or shape differ.
+        """
+        check_geometry(geometry, (self._views, self._rows, self._columns))
+        self._view_table = to_device(self._context, _view_table(geometry, self._view_weight))
+
+    def __call__(
+        self,
+        queue: cl.CommandQueue,
+        filtered_out: Array,
+        projections: Array,
+        *,
+        views: slice | None = None,
+        wait_for: Sequence[cl.Event] | None = None,
+    ) -> cl.Event:
+        """Filter radiographs.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        filtered_out : cl.array.Array
+            float32 (n, rows, columns) [1/mm], overwritten; may be `projections` itself.
+        projections : cl.array.Array
+            float32 (n, rows, columns), line integrals.
+        views : slice, optional
+            The n successive views of the geometry that these are; all by default.
+        wait_for : sequence of cl.Event, optional
+            What has to be done before.
+
+        Returns
+        -------
+        cl.Event
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is none of the above.
+        """
+        build.check_queue(queue, self._context)
+        start, stop = successive(views, self._views)
+        shape = (stop - start, self._rows, self._columns)
+        build.check_array("projections", projections, shape, context=self._context)
+        build.check_array("filtered_out", filtered_out, shape, context=self._context)
+        total = shape[0] * self._rows
+        events = [*(wait_for or ()), *self._last]
+        sizes = (self._columns, self.padded)
+        for first in range(0, total, len(self._lines)):
+            count = min(len(self._lines), total - first)
+            part = self._lines[:count]
+            event = self._weight(
+                queue,
+                (-(-self.padded // self._lanes), count),
+                part,
+                projections,
+                self._view_table[start:],
+                self._row_weight,
+                self._roll,
+                first,
+                count,
+                self._rows,
+                *sizes,
+                wait_for=events,
+            )
+            event = self._fft.apply(queue, part, part, self._ramp, [event])
+            event = self._cut(
+                queue,
+                (-(-self._columns // self._lanes), count),
+                filtered_out,
+                part,
+                first,
+                count,
+                *sizes,
+                wait_for=[event],
+            )
+            events = [event]
+        self._last = events
+        return event
+
+
+def _row_weights(row_weight: ArrayLike | None, rows: int) -> NDArray[np.float32]:
+    if row_weight is None:
+        return np.ones(rows, np.float32)
+    weights = np.ascontiguousarray(row_weight, np.float32)
+    if weights.shape != (rows,) or not np.all(np.isfinite(weights)):
+        raise ValueError(f"row_weight: found shape {weights.shape}, expected {rows} finite numbers")
+    return weights
+
+
+def _view_table(
+    geometry: ConeBeamGeometry, view_weight: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Make the table (views, 6) that ramp.cl reads."""
+    distance = geometry.source_to_detector
+    u, v = geometry.u / distance[:, None], geometry.v / distance[:, None]
+    # Of a panel that does not face the axis, columns are closer as the axis sees them.
+    radius = np.hypot(*geometry.source[:, :2].T)
+    to_axis = -geometry.source[:, :2] / np.maximum(radius, np.finfo(float).tiny)[:, None]
+    along = np.sum(geometry.u[:, :2] * to_axis, axis=1)
+    pitch = np.sqrt(np.maximum(np.sum(geometry.u**2, axis=1) - along**2, 0.0))
+    columns = [
+        geometry.principal[:, 0],
+        geometry.principal[:, 1],
+        np.sum(u * u, axis=1),
+        np.sum(v * v, axis=1),
+        2 * np.sum(u * v, axis=1),
+        view_weight * radius / (distance * pitch),
+    ]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _roll(length: int, margin: int) -> NDArray[np.float64]:
+    """Weights between the end of a row and, cyclically, its start: down to 0, and up again."""
+    weights = np.zeros(length)
+    weights[:margin] = np.cos(np.pi / 2 * np.arange(1, margin + 1) / (margin + 1)) ** 2
+    return np.maximum(weights, weights[::-1])
+
+
+def _ramp_spectrum(length: int, window: str) -> NDArray[np.float32]:
+    """Spectrum of the band-limited ramp: sampling |frequency| itself would lose the mean."""
+    n = np.arange(length)
+    n = np.minimum(n, length - n)
+    kernel = np.where(n % 2 == 1, -1 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
+    kernel[0] = 0.25
+    frequency = np.arange(length // 2 + 1) / length  # cycles a column, up to 1/2
+    factor = {
+        "ram-lak": np.ones_like(frequency),
+        "shepp-logan": np.sinc(frequency),
+        "hann": 0.5 + 0.5 * np.cos(2 * np.pi * frequency),
+    }[window]
+    return np.ascontiguousarray(np.fft.rfft(kernel).real * factor, np.float32)

@@ -1,0 +1,1 @@
+"""Operations on images: band-pass, blur, interpolation, binning."""

@@ -1,0 +1,1 @@
+"""Projectors along rays of a cone beam, and their adjoints."""

@@ -1,0 +1,250 @@
+"""How many views see each voxel, and volumes divided by that number."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import ArrayLike
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid, field_radii
+from clra.ops.filtering.ramp import FADE
+from clra.ops.projection.view_arguments import check_geometry, view_weights
+from clra.ops.runtime import build
+from clra.ops.runtime.buffers import Allocator, Scratch
+from clra.ops.runtime.kernel import Step, to_device
+
+# Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
+# rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
+# twentieth of a back-projection. Where that tenth is less than _ALONG voxels, half or a quarter are
+# in a coarse one: with 4, a panel of 5 rows would see its middle plane 14 % too bright.
+_ACROSS, _ALONG = 8, 4
+# A voxel with less than this part of the most views that see the axis is set to zero: a handful of
+# views gives streaks, not a reconstruction.
+_LEAST = 0.02
+# Part of the views that may fail to see a voxel to the side. All views have to, but a few that are
+# moved far must not narrow the field of view.
+_BLIND = 0.02
+_HEIGHTS = 256
+
+
+def around(planes: slice, of: int) -> slice:
+    """Planes of a grid on which W is the same at `planes` as on the whole grid of `of` planes."""
+    low = max(0, planes.start // _ALONG - 1) * _ALONG
+    return slice(low, min(of, (-(-planes.stop // _ALONG) + 1) * _ALONG))
+
+
+class Coverage:
+    """W(x): the sum, over the views that see x, of their weight and that of the row x falls on.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where the arrays live.
+    geometry : ConeBeamGeometry
+        Of the views.
+    grid : VolumeGrid
+        Of the volume.
+    row_weight : array_like, (rows,)
+        By which the rows of each projection were multiplied.
+    view_weight : array_like, (views,), optional
+        By which each projection was multiplied as a whole; 1 by default.
+    circle : bool
+        Whether volumes are set to zero outside the circle that all views see.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
+
+    Attributes
+    ----------
+    scratch_bytes : int
+        Of scratch memory, which holds W.
+
+    Raises
+    ------
+    ValueError
+        If there is not a weight for each row and view.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        row_weight: ArrayLike,
+        *,
+        view_weight: ArrayLike | None = None,
+        circle: bool = True,
+        allocator: Allocator | None = None,
+    ) -> None:
+        weights = np.asarray(row_weight, np.float64)
+        if weights.shape != (geometry.rows,):
+            raise ValueError(f"row_weight: found {weights.shape}, expected ({geometry.rows},)")
+        self._view_weight = view_weights(view_weight, geometry.views)
+        self._context = context
+        self._grid = grid
+        self._counted = (geometry.views, geometry.rows, geometry.columns)
+        # One row or column is as good as two alike.
+        self._panel = (max(geometry.columns, 2), max(geometry.rows, 2))
+        pixel = np.linalg.norm(geometry.v, axis=1) * geometry.source_to_axis
+        fade = FADE * geometry.rows * abs(np.median(pixel / geometry.source_to_detector))
+        along = next((n for n in (_ALONG, _ALONG // 2) if fade >= n * grid.voxel_size), 1)
+        sizes = self._blocks = np.array([_ACROSS, _ACROSS, along])
+        voxels = np.array(grid.shape[::-1])
+        coarse = -(-voxels // sizes)
+        self._coarse = (int(coarse[0]), int(coarse[1]), int(coarse[2]))
+        # The last one ends where the grid does: beyond that there may be no view at all.
+        middles = 0.5 * ((coarse - 1) * sizes + voxels - 1)
+        self._last_middles = ((middles - 0.5 * (sizes - 1)) / sizes).tolist()
+        self._row_weight, self._circle = weights, circle
+        self._weights = to_device(context, np.resize(weights, self._panel[1]))
+        self._weights_of_views = to_device(context, self._view_weight)
+        self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
+        self.scratch_bytes = self._seen.nbytes
+        self._count = Step(context, "coverage.cl", "coverage", (16, 1, 1))
+        self._normalise = Step(context, "coverage.cl", "normalise", (64, 1, 1))
+        self._last: list[cl.Event] = []
+        self.set_geometry(geometry)
+
+    def set_geometry(self, geometry: ConeBeamGeometry) -> None:
+        """Take other vectors for the same views and panel; :meth:`compute` counts anew.
+
+        Raises
+        ------
+        ValueError
+            If views or panel differ.
+        """
+        check_geometry(geometry, self._counted)
+        self._matrices = to_device(self._context, self._coarse_matrices(geometry))
+        self._least = _LEAST * _most_views(geometry, self._row_weight, self._view_weight)
+        radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
+        self._radius = radius / self._grid.voxel_size if self._circle else math.inf
+
+    def _coarse_matrices(self, geometry: ConeBeamGeometry) -> np.ndarray:
+        """Projection matrices from the middles of coarse voxels."""
+        to_fine = np.diag([*self._blocks, 1.0])
+        to_fine[:3, 3] = (self._blocks - 1) / 2
+        matrices = geometry.projection_matrices() @ self._grid.index_to_world() @ to_fine
+        return np.asarray(matrices.reshape(-1, 12))
+
+    def compute(
+        self, queue: cl.CommandQueue, wait_for: Sequence[cl.Event] | None = None
+    ) -> cl.Event:
+        """Count the views.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        wait_for : sequence of cl.Event, optional
+            What has to be done before.
+
+        Returns
+        -------
+        cl.Event
+        """
+        build.check_queue(queue, self._context)
+        nx, ny, nz = self._coarse
+        event = self._count(
+            queue,
+            (nz, nx, ny),
+            self._seen,
+            self._matrices,
+            self._weights_of_views,
+            self._weights,
+            *self._coarse,
+            *self._last_middles,
+            *self._panel,
+            self._counted[0],
+            wait_for=[*(wait_for or ()), *self._last],
+        )
+        self._last = [event]
+        return event
+
+    def normalise(
+        self,
+        queue: cl.CommandQueue,
+        volume: Array,
+        scale: float,
+        *,
+        first: int = 0,
+        volume_order: str = "zyx",
+        wait_for: Sequence[cl.Event] | None = None,
+    ) -> cl.Event:
+        """Multiply a volume by ``scale / W``, after :meth:`compute`.
+
+        Voxels that hardly any view sees become zero, and so do those outside the circle about the
+        axis that all views see: what lies there was measured in some directions only, and would
+        come back in re-projections as streaks.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        volume : Array
+            float32 (planes, ny, nx), or (ny, nx, planes) with ``volume_order="yxz"``: the grid's
+            volume or a slab of it; changed in place.
+        scale : float
+            Factor.
+        first : int
+            Plane of the grid with which the volume begins.
+        volume_order : {"zyx", "yxz"}
+            Axes of the volume.
+        wait_for : sequence of cl.Event, optional
+            What has to be done before.
+
+        Returns
+        -------
+        cl.Event
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the volume is not of this grid.
+        """
+        build.check_queue(queue, self._context)
+        planes, ny, nx = self._grid.shape
+        slices = volume_order == "zyx"
+        if getattr(volume, "ndim", 0) == 3:
+            planes = min(planes - first, volume.shape[0 if slices else 2])
+        shape = (planes, ny, nx) if slices else (ny, nx, planes)
+        build.check_array("volume", volume, shape, context=self._context)
+        x, y, _ = self._grid.coordinates()
+        size = self._grid.voxel_size
+        event = self._normalise(
+            queue,
+            shape[::-1],
+            volume,
+            self._seen,
+            nx,
+            ny,
+            planes,
+            first,
+            *self._coarse,
+            *self._last_middles,
+            1.0 / _ACROSS,
+            1.0 / float(self._blocks[2]),
+            float(-x[0] / size),
+            float(-y[0] / size),
+            self._radius,
+            self._least,
+            float(scale),
+            int(slices),
+            wait_for=[*(wait_for or ()), *self._last],
+        )
+        self._last = [event]
+        return event
+
+
+def _most_views(
+    geometry: ConeBeamGeometry, row_weight: np.ndarray, view_weight: np.ndarray
+) -> float:
+    """W where it is largest on the axis."""
+    low, high = geometry.source[:, 2].min(), geometry.source[:, 2].max()
+    heights = np.linspace(low, high, _HEIGHTS if high > low else 1)
+    axis = np.column_stack([np.zeros((len(heights), 2)), heights])
+    row = geometry.project(axis)[..., 1]
+    on = (row >= 0) & (row <= geometry.rows - 1)
+    weight = np.interp(row, np.arange(geometry.rows), row_weight)
+    return float((view_weight @ np.where(on, weight, 0.0)).max())

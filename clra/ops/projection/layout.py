@@ -1,0 +1,304 @@
+"""What the projectors share: their table of views, and the order that they want data in.
+
+Kernels read projections as (view, column, row) and volumes as (y, x, z), see geometry.clh. A
+:class:`Layout` turns the caller's arrays into those and back, in scratch memory of its own.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.ops.projection.transpose import Planes, Transpose
+from clra.ops.projection.view_arguments import check_geometry, successive
+from clra.ops.runtime import build
+from clra.ops.runtime.buffers import Allocator, Scratch, within
+from clra.ops.runtime.kernel import to_device
+
+_PAD = 24  # as in geometry.clh
+_PIECE = 32  # the most that kernels read from where they are, past the last line's end
+
+# Projections that one launch treats. They have to stay in the last cache of a CPU, and few launches
+# have to read and write the volume.
+_CPU_BYTES = 24 << 20
+_GPU_BYTES = 256 << 20
+_LEAST_VIEWS = 8
+
+
+class Layout:
+    """Views of a geometry on the device, with scratch for projections and a volume.
+
+    Parameters
+    ----------
+    context : cl.Context
+        Where the arrays live.
+    geometry : ConeBeamGeometry
+        Of the projections.
+    grid : VolumeGrid
+        Of the volume.
+    volume_order : {"zyx", "yxz"}
+        Order of the caller's volume.
+    lanes : {1, 8, 16}, optional
+        Form of the kernels, the one for the device by default; the others serve tests.
+    tilted : bool
+        Treat axial views as tilted ones; serves tests.
+    allocator : callable, optional
+        Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
+    scratch_limit : int, optional
+        Bytes of scratch for projections; fewer views are treated at a time, at least one.
+
+    Attributes
+    ----------
+    lanes : int
+        As above.
+    columnar : bool
+        Whether the kernels for columns apply, to a CPU and v parallel to z.
+    steep : bool
+        Whether rays may advance fastest along z.
+    table : Array
+        (views, 24), see geometry.clh.
+    sizes : tuple of int
+        nx, ny, nz.
+    panel : tuple of int
+        Columns, rows and elements of a padded line.
+    scratch_bytes : int
+        Most bytes of scratch memory that it takes.
+    last : list of cl.Event
+        What the next call has to wait for, because it uses the same scratch.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        volume_order: str,
+        lanes: int | None = None,
+        tilted: bool = False,
+        allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
+    ) -> None:
+        cpu = build.is_cpu(build.device_of(context))
+        self.context = context
+        self.grid = grid
+        self.lanes = lanes or _best_lanes(build.device_of(context))
+        self.sizes = grid.shape[::-1]
+        self.panel = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
+        self.last: list[cl.Event] = []
+        self._views = geometry.views
+        self._tilted = tilted
+        self.volume_order = volume_order
+        self._volume_shape = volume_shape(grid, volume_order)
+        self._bytes = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
+        self._least = _LEAST_VIEWS if scratch_limit is None else 1
+        self._transpose = Transpose(context, min(self.lanes, 8))
+        self._lines: Array | None = None
+        self._volume: Array | None = None
+        self._memory = Scratch(context, allocator)
+        lines = min(geometry.views, self._most) * self._view_elements
+        self.scratch_bytes = 4 * (lines + _PIECE)
+        if volume_order == "zyx":
+            self.scratch_bytes += 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
+        self.set_geometry(geometry)
+
+    def set_geometry(self, geometry: ConeBeamGeometry) -> None:
+        """Take other vectors of the same views and panel."""
+        check_geometry(geometry, (self._views, self.panel[1], self.panel[0]))
+        self.table = to_device(self.context, view_table(geometry, self.grid))
+        self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
+        self.steep = not geometry.axial and _steep(geometry)
+
+    def check(
+        self,
+        queue: cl.CommandQueue,
+        names: tuple[str, str],
+        volume: Array,
+        projections: Array,
+        views: slice | None,
+    ) -> tuple[int, int]:
+        """Refuse what does not fit; first of the views, and one past the last."""
+        start, stop = successive(views, self._views)
+        build.check_queue(queue, self.context)
+        columns, rows, _ = self.panel
+        build.check_array(names[0], volume, self._volume_shape, context=self.context)
+        shape = (stop - start, rows, columns)
+        build.check_array(names[1], projections, shape, context=self.context)
+        return start, stop
+
+    @property
+    def _view_elements(self) -> int:
+        """Elements of a view's padded lines."""
+        columns, _, pitch = self.panel
+        return (columns + 1) * pitch
+
+    @property
+    def _most(self) -> int:
+        """Views that one launch treats."""
+        return max(self._least, self._bytes // (4 * self._view_elements))
+
+    def batches(self, count: int) -> Iterator[tuple[int, int]]:
+        """Cut `count` views into runs that fit the scratch."""
+        runs = -(-count // self._most)
+        for run in range(runs):
+            yield count * run // runs, count * (run + 1) // runs
+
+    def gather_projections(
+        self, queue: cl.CommandQueue, projections: Array, wait_for: Sequence[cl.Event]
+    ) -> tuple[Array, cl.Event]:
+        """Projections in the kernels' order, padded, in scratch."""
+        lines = self.scratch_projections(len(projections))
+        columns, rows, pitch = self.panel
+        event = self._transpose(
+            queue,
+            Planes(lines, (columns + 1) * pitch, pitch, columns + 1, pitch),
+            Planes(projections, rows * columns, columns, rows, columns),
+            len(projections),
+            before=_PAD,
+            wait_for=wait_for,
+        )
+        return lines, event
+
+    def scatter_projections(
+        self,
+        queue: cl.CommandQueue,
+        projections: Array,
+        accumulate: bool,
+        wait_for: Sequence[cl.Event],
+    ) -> cl.Event:
+        """From scratch to the caller's projections."""
+        columns, rows, pitch = self.panel
+        lines = self.scratch_projections(len(projections))[:, :, _PAD:]
+        return self._transpose(
+            queue,
+            Planes(projections, rows * columns, columns, rows, columns),
+            Planes(lines, (columns + 1) * pitch, pitch, columns, rows),
+            len(projections),
+            accumulate=accumulate,
+            wait_for=wait_for,
+        )
+
+    def scratch_projections(self, count: int) -> Array:
+        """Lines of `count` views, (count, columns + 1, pitch)."""
+        columns, _, pitch = self.panel
+        if self._lines is None or len(self._lines) < count:
+            size = count * (columns + 1) * pitch
+            flat = self._memory.empty((size + _PIECE,))
+            self._lines = flat[:size].reshape(count, columns + 1, pitch)
+        lines: Array = self._lines[:count]
+        return lines
+
+    def gather_volume(
+        self, queue: cl.CommandQueue, volume: Array, wait_for: Sequence[cl.Event]
+    ) -> tuple[Array, Sequence[cl.Event]]:
+        """Volume in the kernels' order."""
+        if self.volume_order == "yxz":
+            return volume, wait_for
+        nx, ny, nz = self.sizes
+        columns = self.scratch_volume(volume)
+        event = self._transpose(
+            queue,
+            Planes(columns, nx * nz, nz, nx, nz),
+            Planes(volume, nx, nx * ny, nz, nx),
+            ny,
+            wait_for=wait_for,
+        )
+        return columns, [event]
+
+    def scatter_volume(
+        self, queue: cl.CommandQueue, volume: Array, accumulate: bool, wait_for: Sequence[cl.Event]
+    ) -> cl.Event:
+        """From scratch to the caller's volume, in the order (z, y, x)."""
+        nx, ny, nz = self.sizes
+        columns = self.scratch_volume(volume)
+        return self._transpose(
+            queue,
+            Planes(volume, nx, nx * ny, nz, nx),
+            Planes(columns, nx * nz, nz, nx, nz),
+            ny,
+            accumulate=accumulate,
+            wait_for=wait_for,
+        )
+
+    def scratch_volume(self, volume: Array) -> Array:
+        """Where kernels write a volume: the caller's own in the order (y, x, z)."""
+        if self.volume_order == "yxz":
+            return volume
+        if self._volume is None:
+            nx, ny, nz = self.sizes
+            self._volume = self._memory.empty((ny, nx, nz))
+        return self._volume
+
+
+def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
+    """Shape of a volume whose axes are in that order.
+
+    Raises
+    ------
+    ValueError
+        If it is neither "zyx" nor "yxz".
+    """
+    if order not in ("zyx", "yxz"):
+        raise ValueError(f"volume_order: found {order!r}, expected 'zyx' or 'yxz'")
+    nz, ny, nx = grid.shape
+    return (nz, ny, nx) if order == "zyx" else (ny, nx, nz)
+
+
+def _steep(geometry: ConeBeamGeometry) -> bool:
+    """Whether any ray may advance faster along z than along x and y."""
+    across, down = (0.5 * (n - 1) for n in (geometry.columns, geometry.rows))
+    centre = geometry.detector - geometry.source
+    corners = np.stack(
+        [centre + a * across * geometry.u + b * down * geometry.v for a in (-1, 1) for b in (-1, 1)]
+    )
+    # Over the panel, |z| is at most that of a corner, the larger of |x| and |y| at least the
+    # distance from the axis of z over the root of 2, and that distance at least its part along the
+    # way to the centre.
+    level = centre[:, :2] / np.linalg.norm(centre[:, :2], axis=1, keepdims=True).clip(1e-30)
+    nearest = np.sum(corners[:, :, :2] * level, axis=2).min(axis=0)
+    highest = np.abs(corners[:, :, 2]).max(axis=0)
+    return bool(np.any(1.0001 * highest > nearest / np.sqrt(2)))
+
+
+def _best_lanes(device: cl.Device) -> int:
+    """Lanes of the kernels, see geometry.clh."""
+    if not build.is_cpu(device):
+        return 1
+    return 16 if device.native_vector_width_float >= 16 else 8
+
+
+def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:
+    """Compose in float64 what geometry.clh calls a view, (views, 24).
+
+    Raises
+    ------
+    ValueError
+        If a voxel, or the one beyond the last, is not in front of a source.
+    """
+    index_to_world = grid.index_to_world()
+    matrices = geometry.projection_matrices() @ index_to_world
+    ends = [(-1.0, float(n)) for n in grid.shape[::-1]]
+    corners = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(8, 3)
+    depth = (matrices[:, 2, :3] @ corners.T + matrices[:, 2, 3:]).min(axis=1)
+    if not depth.min() > 0:
+        raise ValueError(
+            f"grid: it reaches behind the source of view {int(depth.argmin())}, expected every "
+            "voxel and the one beyond in front of every source"
+        )
+    corner = (
+        geometry.detector
+        - geometry.source
+        - 0.5 * (geometry.columns - 1) * geometry.u
+        - 0.5 * (geometry.rows - 1) * geometry.v
+    )
+    source = (geometry.source - index_to_world[:3, 3]) / grid.voxel_size
+    steps = [vector / grid.voxel_size for vector in (corner, geometry.u, geometry.v)]
+    if geometry.axial:
+        # Exactly, so that the rays of a column share their place in a plane to the last bit.
+        matrices[:, [0, 2], 2] = 0
+        steps[2][:, :2] = 0
+    table = np.concatenate([matrices.reshape(-1, 12), source, *steps], axis=1)
+    return np.ascontiguousarray(table, dtype=np.float32)

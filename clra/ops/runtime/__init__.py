@@ -1,0 +1,1 @@
+"""OpenCL itself: devices, builds, kernels and buffers."""

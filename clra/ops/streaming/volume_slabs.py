@@ -1,0 +1,200 @@
+"""Volumes that may lie in slabs: how they are filled, changed, projected and back-projected."""
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.model.view_selection import runs, views_that_see
+from clra.ops.projection.projector import BackProjector, ForwardProjector
+from clra.ops.streaming.memory import Reused
+from clra.ops.streaming.stream import Stream, Volume
+
+
+def constant_volume(
+    stream: Stream, grid: VolumeGrid, value: float = 0.0, *, volumes: int = 1
+) -> Volume:
+    """Return a volume of one value.
+
+    Parameters
+    ----------
+    stream : Stream
+        Where it lives.
+    grid : VolumeGrid
+        Of the volume.
+    value : float
+        Of every voxel.
+    volumes : int
+        As for :class:`~clra.ops.streaming.stream.Volume`.
+    """
+    volume = Volume(stream, grid, volumes=volumes)
+    for index, slab in enumerate(volume.slabs):
+        nz, ny, nx = slab.shape
+        part = stream.empty((ny, nx, nz))
+        part.fill(np.float32(value), queue=stream.queue)
+        volume.put(index, part)
+    return volume
+
+
+def volume_from(stream: Stream, grid: VolumeGrid, values: Any, *, volumes: int = 1) -> Volume:
+    """Return the volume that an array (z, y, x) holds.
+
+    Parameters
+    ----------
+    stream : Stream
+        Where it lives.
+    grid : VolumeGrid
+        Of the volume.
+    values : array-like object, (nz, ny, nx)
+        Sliced along z.
+    volumes : int
+        As for :class:`~clra.ops.streaming.stream.Volume`.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
+    if tuple(values.shape) != grid.shape:
+        raise ValueError(f"volume: found shape {tuple(values.shape)}, expected {grid.shape}")
+    volume = Volume(stream, grid, volumes=volumes)
+    for index, planes in enumerate(volume.planes):
+        host = np.moveaxis(np.asarray(values[planes], np.float32), 0, 2)
+        part = stream.empty(host.shape)
+        part.set(np.ascontiguousarray(host), queue=stream.queue)
+        volume.put(index, part)
+    return volume
+
+
+def writable(stream: Stream, volume: Volume, index: int) -> Array:
+    """Return slab `index` to be changed and put back: the volume's own, or a copy of a kept one."""
+    part = volume.get(index)
+    if len(volume.planes) == 1:
+        return part
+    own = stream.empty(part.shape)
+    source: Any = part.base_data
+    target: Any = own.base_data
+    cl.enqueue_copy(stream.queue, target, source, byte_count=part.nbytes).wait()
+    return own
+
+
+class SlabProjector:
+    """Forward projection of a volume, slab by slab.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    volume : Volume
+        To be projected; its slabs are fetched at each call.
+    geometry : ConeBeamGeometry
+        Of the projections.
+    """
+
+    def __init__(self, stream: Stream, volume: Volume, geometry: ConeBeamGeometry) -> None:
+        self._queue = stream.queue
+        self._volume = volume
+        scratch = Reused(stream.memory)
+        slabs = volume.slabs
+        self._seeing = [views_that_see(geometry, slab) for slab in slabs]
+        self._projectors = [
+            ForwardProjector(
+                stream.context,
+                geometry,
+                slab,
+                volume_order="yxz",
+                allocator=scratch,
+                scratch_limit=stream.scratch_limit,
+            )
+            for slab in slabs
+        ]
+
+    def __call__(self, projections_out: Array, views: slice) -> cl.Event:
+        """Project some views, on the stream's queue.
+
+        Parameters
+        ----------
+        projections_out : cl.array.Array
+            float32 (n, rows, columns), overwritten.
+        views : slice
+            The n successive views of the geometry. Slabs that none of them sees are not fetched.
+        """
+        seen = [
+            index for index, views_seeing in enumerate(self._seeing) if views_seeing[views].any()
+        ]
+        if not seen:
+            projections_out.fill(0.0, queue=self._queue)
+            return cl.enqueue_marker(self._queue)
+        for index in seen:
+            event = self._projectors[index](
+                self._queue,
+                projections_out,
+                self._volume.get(index),
+                views=views,
+                accumulate=index != seen[0],
+            )
+            if len(seen) > 1:
+                event.wait()  # the slab is let go
+        return event
+
+
+class SlabAdjoint:
+    """Exact adjoint of :class:`SlabProjector`, added to a volume slab by slab.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    volume : Volume
+        Whose grid and slabs are meant.
+    geometry : ConeBeamGeometry
+        Of the projections.
+    """
+
+    def __init__(self, stream: Stream, volume: Volume, geometry: ConeBeamGeometry) -> None:
+        self._stream = stream
+        scratch = Reused(stream.memory)
+        slabs = volume.slabs
+        self._seeing = [views_that_see(geometry, slab) for slab in slabs]
+        self._projectors = [
+            BackProjector(
+                stream.context,
+                geometry,
+                slab,
+                matched=True,
+                volume_order="yxz",
+                allocator=scratch,
+                scratch_limit=stream.scratch_limit,
+            )
+            for slab in slabs
+        ]
+
+    def __call__(self, volume: Volume, projections: Array, views: slice) -> None:
+        """Add the adjoint of some views, on the stream's queue.
+
+        Parameters
+        ----------
+        volume : Volume
+            In the slabs given before; its unit is that of the projections times mm.
+        projections : cl.array.Array
+            float32 (n, rows, columns).
+        views : slice
+            The n successive views of the geometry. Slabs that none of them sees are not fetched.
+        """
+        for index, back in enumerate(self._projectors):
+            seen = list(runs(self._seeing[index][views]))
+            if not seen:
+                continue
+            part = writable(self._stream, volume, index)
+            for run in seen:
+                back(
+                    self._stream.queue,
+                    part,
+                    projections[run],
+                    views=slice(views.start + run.start, views.start + run.stop),
+                    accumulate=True,
+                )
+            volume.put(index, part)

@@ -1,0 +1,132 @@
+import base64
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from clra.app.records import Record
+from clra.app.report.comparison import Comparison, Match, Pair
+from clra.app.report.html_report import render, write_report
+from clra.app.report.summary import Errors, Findings, summary_of
+from clra.app.scan_description import Facts
+from clra.methods.alignment.quality import Quality
+from clra.model.motion import Motion
+
+
+class Checker(HTMLParser):
+    """Counts figures and captions and refuses what a browser would fetch or run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.images: list[dict[str, str]] = []
+        self.captions = 0
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        assert tag not in ("script", "link", "iframe")
+        assert not any(v and v.startswith(("http:", "https:", "//")) for v in values.values())
+        if tag == "img":
+            self.images.append(values)
+        self.captions += tag == "figcaption"
+        if tag not in ("img", "meta", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+_QUALITY = Quality(2, 0.514, 0.137, 0.083, 0.041, 1.75)
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    random = np.random.default_rng(1)
+
+    def pair(*shape: int) -> Pair:
+        image = random.random(shape).astype(np.float32)
+        return Pair(image, 2 * image)
+
+    measured = pair(41, 33)
+    match = Match(11, "farthest moved", measured.before, measured.after, pair(41, 33))
+    return Comparison(pair(33, 33), pair(40, 33), pair(8, 8), 0.005, "a method", (match,), 0.01)
+
+
+@pytest.fixture(scope="module")
+def page(record, scan, comparison) -> str:
+    errors = Errors.of(record, scan)
+    return render(Findings(record, errors, comparison, Facts.of(scan).lines(), _QUALITY))
+
+
+def test_the_page_is_well_formed_and_needs_nothing_else(page):
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    assert len(checker.images) == checker.captions == 8
+    for image in checker.images:
+        kind, data = re.fullmatch(r"data:image/(.+);base64,(.+)", image["src"]).groups()
+        content = base64.b64decode(data, validate=True)
+        assert content.startswith(b"\x89PNG" if kind == "png" else b"<?xml")
+        assert image["alt"]
+
+
+def test_the_page_tells_all_there_is(page, record):
+    for part in (
+        "Alignment of tiny",
+        "<p>few features</p>\n<p>3 &lt; 4 views</p>",
+        "Correction of each radiograph",
+        "the inverse of the estimated motion",
+        "Convergence",
+        "Error of each view",
+        "Before and after",
+        "reconstructed by a method",
+        "re-projections",
+        "translation x",
+        "Flagged views: 3, 17",
+        "gauge-free, without flagged views",
+        "2 of 24 views flagged",
+        "1QR-1HR",
+        "a device",
+        record.about["checksum"],
+        "space-filling",
+        "4.00 times",  # doubled pictures have four times the squared gradient
+        "clra 0.",
+    ):
+        assert part in page, part
+
+
+def test_the_page_says_what_the_radiographs_alone_tell(page):
+    section = page.partition("What the radiographs alone tell")[2].partition("</section>")[0]
+    for number in ("51.4 %", "13.7 %", "0.083, 0.041", "1.75", "binned by 2"):
+        assert number in section
+
+
+def test_text_from_files_is_escaped(page):
+    assert "clra align &lt;scan&gt;.nxs" in page
+    assert "<scan>" not in page
+
+
+def test_the_same_report_twice_is_the_same_page(page, record, scan, comparison):
+    errors = Errors.of(record, scan)
+    again = Findings(record, errors, comparison, Facts.of(scan).lines(), _QUALITY)
+    assert render(again) == page
+
+
+def test_a_motion_alone_makes_a_page(tmp_path):
+    bare = Record(Motion.identity(5), np.ones(5))
+    write_report(tmp_path / "r.html", Findings(bare))
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "--scan SCAN" in page and "Convergence" not in page and "Warnings" not in page
+    assert [file.name for file in tmp_path.iterdir()] == ["r.html"]
+
+
+def test_errors_are_those_of_the_estimate(record, scan):
+    errors = Errors.of(record, scan)
+    truth = scan.truth
+    expected = np.abs(record.motion.shift_u - truth.shift_u).mean()
+    means = errors.means()
+    assert means["mae_u"] == pytest.approx(expected)
+    assert 0 < means["gauge_free_mae_u"] < 1.2 * expected
+    _, text = summary_of(record, errors)
+    assert "1QR-1HR" in text and f"{expected:.3f}" in text

@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+
+from clra.errors import InputError
+from clra.io.frames.counts import Radiographs
+
+NONE = np.array([], np.intp)
+
+
+def radiographs(frames: np.ndarray, **changes: object) -> Radiographs:
+    """Frame 0 dark, 1 flat, the others radiographs."""
+    roles = {"views": np.arange(2, len(frames)), "flats": np.array([1]), "darks": np.array([0])}
+    return Radiographs(frames, path="scan.nxs", **{**roles, **changes})
+
+
+def frames(count: int = 3, shape: tuple[int, int] = (11, 13)) -> np.ndarray:
+    counts = np.full((2 + count, *shape), 600.0)
+    counts[0], counts[1] = 100.0, 1100.0
+    return counts
+
+
+def test_flats_run_from_group_to_group() -> None:
+    counts = np.ones((9, 3, 5))
+    flat = {0: 10.0, 1: 20.0, 4: 30.0, 8: 50.0}
+    for frame, level in flat.items():
+        counts[frame] = level
+    views = np.array([2, 3, 5, 6, 7])
+    found = Radiographs(
+        counts, path="scan.nxs", views=views, flats=np.array(list(flat)), darks=NONE
+    )
+    # Groups stand at frames 0.5, 4 and 8.
+    expected = 1 / np.interp(views, [0.5, 4, 8], [15, 30, 50])
+    np.testing.assert_allclose(found[:][:, 1, 2], expected, rtol=1e-6)
+    assert found.notes == ("no dark frame: 0 counts taken as dark",)
+
+
+def test_outside_the_groups_the_nearest_flat_holds() -> None:
+    counts = np.ones((5, 3, 5))
+    counts[1], counts[3] = 10.0, 20.0
+    found = Radiographs(
+        counts, path="scan.nxs", views=np.array([0, 4]), flats=np.array([1, 3]), darks=NONE
+    )
+    np.testing.assert_allclose(found[:][:, 0, 0], [0.1, 0.05], rtol=1e-6)
+
+
+def test_dead_pixels_get_the_median_beside_them() -> None:
+    counts = frames()
+    ramp = np.arange(13.0)
+    counts[2:] = 600 + 10 * ramp
+    counts[1, 4, 6] = 90.0
+    counts[2:, 4, 6] = 60000.0
+    found = radiographs(counts)
+    beside = np.sort((500 + 10 * ramp[[5, 5, 5, 6, 6, 7, 7, 7]]) / 1000)
+    np.testing.assert_allclose(found[0][4, 6], np.median(beside), rtol=1e-6)
+    assert found.notes == ("1 dead pixels (flat not above dark) filled from beside",)
+    assert found.mask is None
+
+
+def test_clusters_of_dead_pixels_are_masked() -> None:
+    counts = frames()
+    counts[1, 2:9, 3:10] = 100.0
+    found = radiographs(counts)
+    expected = np.ones((11, 13), bool)
+    expected[4:7, 5:8] = False  # more than two pixels inside
+    np.testing.assert_array_equal(found.mask, expected)
+    np.testing.assert_allclose(found[:], 0.5, rtol=1e-6)
+
+
+def test_a_dead_corner_of_a_tiny_panel() -> None:
+    counts = frames(shape=(1, 2))
+    counts[1, 0, 0] = 0.0
+    np.testing.assert_allclose(radiographs(counts)[:], 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_pixels_that_are_no_numbers_are_found_when_read(bad: float) -> None:
+    counts = frames(4)
+    counts[4, 0, :3] = bad
+    found = radiographs(counts)
+    found[0:2]
+    with pytest.raises(InputError, match=r"scan\.nxs: frames: found frame 4 with 3 pixels"):
+        found[1:4]
+
+
+def test_bad_flats_are_found_at_once() -> None:
+    counts = frames()
+    counts[1, 0, 0] = np.nan
+    with pytest.raises(InputError, match="frame 1 with 1 pixels that are no finite numbers"):
+        radiographs(counts)
+
+
+def test_saturated_frames() -> None:
+    counts = frames(4).astype(np.uint16)
+    counts[3, 0, 0] = 65535
+    found = radiographs(counts)
+    with pytest.warns(UserWarning, match="frame 3 with 1 pixels at 65535 counts: saturated"):
+        found[0:4]
+    found[0:4]  # said once: a second warning would be an error here
+    counts[4, 0, :2] = 65535
+    found[0:1]
+    with pytest.raises(InputError, match=r"frame 4 with 2 pixels at 65535 counts.* at most 1%"):
+        found[1:4]
+
+
+def test_declared_saturation_and_saturated_flats() -> None:
+    counts = frames(4)
+    counts[5, 3] = 4095.0
+    found = radiographs(counts, saturation=4095.0)
+    with pytest.raises(InputError, match="frame 5 with 13 pixels at 4095 counts"):
+        found[:]
+    counts[1] = 4095.0
+    with pytest.raises(InputError, match="frame 1 with 143 pixels at 4095"):
+        radiographs(counts, saturation=4095.0)
+
+
+def test_normalised_frames_pass_unchanged() -> None:
+    pixels = np.random.default_rng(0).random((4, 3, 5)).astype(np.float32)
+    found = Radiographs(
+        pixels, path="scan.nxs", views=np.arange(4), flats=NONE, darks=NONE, normalised=True
+    )
+    np.testing.assert_array_equal(found[1:3], pixels[1:3])
+    assert found[0:0].shape == (0, 3, 5)
+    assert len(found) == 4
+
+
+def test_frames_that_cannot_be_read() -> None:
+    class Broken(np.ndarray):
+        def __getitem__(self, index: object) -> np.ndarray:
+            raise OSError("inflate() failed")
+
+    found = radiographs(frames())
+    found._frames = frames().view(Broken)
+    with pytest.raises(InputError, match=r"frames 2 to 4: inflate\(\) failed"):
+        found[0:3]

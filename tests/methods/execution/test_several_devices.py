@@ -1,0 +1,93 @@
+"""A reconstruction shared out to several devices is the one that a single device makes."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import clra
+from clra.methods.execution.several_devices import on_devices
+from clra.ops.runtime.devices import NoDeviceError, choose_device
+
+TWICE = """
+import sys
+import numpy as np
+import clra
+from clra.app.simulation import paper_like, sample, simulated_scan
+from clra.methods.execution import several_devices
+from clra.ops.runtime.devices import choose_devices
+
+devices = choose_devices("all")
+if len(devices) < 2:
+    print("one device")
+    sys.exit()
+geometry = paper_like("helix", 320, (64, 64))
+truth = clra.Motion.identity(320)
+scan = simulated_scan(geometry, sample("spheres", geometry), truth, name="shared")
+worked = set()
+run = several_devices._Worker.run
+
+
+def watched(self, *rest):
+    worked.add(self._stream.device.int_ptr)
+    run(self, *rest)
+
+
+several_devices._Worker.run = watched
+for method in ("fbp", "katsevich"):
+    progress = []
+    shared = clra.reconstruct(scan, method, device="all", progress=progress.append)
+    alone = clra.reconstruct(scan, method)
+    assert np.linalg.norm(shared - alone) < 1e-5 * np.linalg.norm(alone), method
+    assert (shared != 0).any(axis=(1, 2)).sum() > 10
+    assert [p.done for p in progress] == sorted(p.done for p in progress)
+    assert progress[-1].done == progress[-1].total
+assert worked == {device.int_ptr for device in devices}
+print("shared by", len(worked))
+"""
+
+
+def test_two_devices_share_the_work():
+    environment = {**os.environ, "POCL_DEVICES": "pthread pthread"}
+    done = subprocess.run(
+        [sys.executable, "-c", TWICE], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    if done.stdout.strip() == "one device":
+        pytest.skip("no driver that shows two devices")
+    assert done.stdout.strip() == "shared by 2"
+
+
+def test_the_first_failure_is_told():
+    def work(stream, planes, target):
+        raise ValueError(f"plane {planes.start}")
+
+    device = choose_device()
+    with pytest.raises(ValueError, match="plane"):
+        on_devices([device, device], work, 7, None)
+
+
+def test_every_plane_is_taken_once():
+    taken = []
+
+    class Target:
+        def write(self, start, planes):
+            taken.append((start, len(planes)))
+
+    def work(stream, planes, target):
+        for plane in range(planes.stop - planes.start):
+            target.write(plane, [None])
+
+    device = choose_device()
+    on_devices([device, device, device], work, 23, Target())
+    assert sorted(taken) == [(plane, 1) for plane in range(23)]
+
+
+def test_alignment_takes_one_device():
+    geometry = clra.circular(
+        4, source_to_axis=50.0, source_to_detector=100.0, pixel_size=1.0, shape=(64, 64)
+    )
+    with pytest.raises(NoDeviceError, match="no OpenCL device 'all'"):
+        clra.align(clra.Scan(np.zeros((4, 64, 64), np.float32), geometry), device="all")

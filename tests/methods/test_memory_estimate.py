@@ -1,0 +1,71 @@
+"""The memory that methods are said to take is what they take."""
+
+import numpy as np
+import pytest
+
+import clra
+from clra.app.simulation import paper_like
+from clra.methods.alignment import align
+from clra.methods.memory_estimate import alignment_need, multigrid_need, reconstruction_need
+from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.reconstruction.imgr import imgr
+from clra.model.grid import default_grid
+from clra.ops.streaming.stream import HostPlanes, Radiographs, Stream
+
+MIB = 1 << 20
+AGREES = 0.2  # part by which prediction and measurement may differ
+
+
+def _scan(views=150, panel=(120, 96)):
+    geometry = paper_like("helix", views, panel)
+    pixels = np.random.default_rng(0).random((views, *panel), np.float32)
+    return clra.Scan(pixels, geometry)
+
+
+@pytest.mark.parametrize("budget", [None, 16 * MIB, 6 * MIB])
+def test_reconstruction_takes_what_is_predicted(budget):
+    scan = _scan()
+    stream = Stream(max_device_memory=budget)
+    grid = default_grid(scan.geometry)
+    target = HostPlanes(grid)
+    ramp_fbp(stream, Radiographs(stream, scan, 1), scan.geometry, grid, target=target)
+    need = reconstruction_need(stream.budgets, scan.geometry, grid)
+    assert stream.memory.peak == pytest.approx(need.device, rel=AGREES)
+    assert need.device <= stream.budgets.device
+    assert stream.memory.taken == 0
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of noise nothing can be found
+@pytest.mark.parametrize(
+    ("panel", "level", "budget"),
+    [
+        ((120, 96), 2, None),
+        ((120, 96), 2, 12 * MIB),
+        ((300, 280), 1, 64 * MIB),  # large enough for registration without a correction
+    ],
+)
+def test_alignment_takes_what_is_predicted(panel, level, budget, monkeypatch):
+    scan = _scan(150 if level == 2 else 40, panel)
+    streams = []
+
+    def remembered(*arguments, **options):
+        streams.append(Stream(*arguments, **options))
+        return streams[-1]
+
+    monkeypatch.setattr(align, "Stream", remembered)
+    schedule = {1: "1FR", 2: "1HR"}[level]
+    clra.align(scan, schedule=schedule, max_device_memory=budget)
+    need = alignment_need(streams[0].budgets, scan.geometry, default_grid(scan.geometry), level)
+    assert streams[0].memory.peak == pytest.approx(need.device, rel=AGREES)
+    assert need.device <= streams[0].budgets.device
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("budget", [None, 12 * MIB])
+def test_multigrid_takes_what_is_predicted(budget):
+    scan = _scan()
+    stream = Stream(max_device_memory=budget)
+    grid = default_grid(scan.geometry)
+    imgr(stream, scan, grid, align=True, cycles=1)
+    need = multigrid_need(stream.budgets, scan.geometry, grid)
+    assert stream.memory.peak == pytest.approx(need.device, rel=AGREES)

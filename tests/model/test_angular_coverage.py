@@ -1,0 +1,72 @@
+"""Views of a circle stand for parts of the turn."""
+
+import math
+
+import numpy as np
+import pytest
+
+import clra
+from clra.model.angular_coverage import angle_weights, part_of_a_turn
+from clra.model.trajectory import circular, helix
+
+PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 0.5, "shape": (7, 96)}
+PARALLEL = PANEL | {"source_to_axis": 5e4, "source_to_detector": 5e4}
+
+
+def _joined(*parts):
+    return clra.ConeBeamGeometry.from_astra(
+        np.concatenate([part.to_astra() for part in parts]), (7, 96)
+    )
+
+
+@pytest.mark.parametrize("views", [1, 2, 7, 360])
+@pytest.mark.parametrize("turns", [0.5, 0.6, 1, 2, -3])
+def test_even_views_weigh_the_same_also_on_a_part_of_the_turn(views, turns):
+    geometry = circular(views, arc=2 * math.pi * turns, start=0.3, **PANEL)
+    assert (angle_weights(geometry) == 1).all()
+
+
+def test_helices_are_left_alone():
+    assert (angle_weights(helix(50, angle_step=0.3, z_step=0.1, **PANEL)) == 1).all()
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_views_weigh_as_much_as_the_angle_they_stand_for(shuffled):
+    dense = circular(240, arc=math.pi / 2, **PANEL)
+    sparse = circular(120, arc=1.5 * math.pi, start=math.pi / 2, **PANEL)
+    order = np.random.default_rng(0).permutation(360) if shuffled else np.arange(360)
+    weights = np.empty(360)
+    weights[order] = angle_weights(_joined(dense, sparse).subset(order))
+    assert weights.mean() == pytest.approx(1)
+    # A quarter of the turn has 240 views, three quarters have 120.
+    assert weights[6:234] == pytest.approx(0.25 * 360 / 240)
+    assert weights[246:354] == pytest.approx(0.75 * 360 / 120)
+
+
+def test_what_is_seen_in_two_turns_weighs_half_in_each():
+    weights = angle_weights(circular(300, arc=3 * math.pi, **PANEL))
+    # In units of the first half of the turn's: 200 views of 1/2 and 100 of 1 have a mean of 2/3.
+    assert weights[np.r_[6:94, 206:294]] == pytest.approx(0.5 / (2 / 3))
+    assert weights[106:194] == pytest.approx(1 / (2 / 3))
+
+
+@pytest.mark.parametrize(
+    ("geometry", "covered"),
+    [
+        (circular(180, arc=math.radians(207), **PANEL), "207 degrees of the circle, expected 360"),
+        (circular(180, arc=math.pi, **PANEL), "180 degrees"),
+        (
+            circular(180, arc=1.5 * math.pi, **PARALLEL),
+            "270 degrees of the circle, expected 180 or",
+        ),
+        (circular(180, **PANEL), ""),
+        (circular(270, arc=3 * math.pi, **PANEL), ""),
+        (circular(180, arc=math.pi, **PARALLEL), ""),
+        (circular(180, **PANEL).subset(np.r_[0:50, 53:180]), ""),
+        (circular(1, **PANEL), ""),
+        (helix(50, angle_step=0.05, z_step=0.1, **PANEL), ""),
+    ],
+)
+def test_a_part_of_a_turn_is_said(geometry, covered):
+    said = part_of_a_turn(geometry)
+    assert covered in said and bool(said) == bool(covered)
