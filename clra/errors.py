@@ -1,4 +1,4 @@
-"""What clra raises and warns of; each message is one line."""
+"""What clra raises and warns of; each message is one line, but for a compiler's log."""
 
 from __future__ import annotations
 
@@ -82,16 +82,15 @@ class OutputError(OSError):
 
 
 class DeviceError(RuntimeError):
-    """No usable OpenCL device: there is none, none of that name, or it fails the self-test.
+    """No usable OpenCL device: there is none, none of that name, or it fails the self-test."""
 
-    Parameters
-    ----------
-    message : str
-        Line breaks in it become blanks.
-    """
 
-    def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+class KernelBuildError(DeviceError):
+    """A kernel did not compile; the message carries the compiler's log."""
+
+
+class Cancelled(Exception):  # noqa: N818  (an answer to a callback, not a fault)
+    """Raised by a progress callback to end a long call early, keeping what is finished."""
 
 
 class ClraWarning(UserWarning):
