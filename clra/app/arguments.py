@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+from clra.errors import InputError
+
 
 def panel(option: str, text: str) -> tuple[int, int]:
     """Read "ROWSxCOLUMNS".
@@ -16,12 +18,12 @@ def panel(option: str, text: str) -> tuple[int, int]:
 
     Raises
     ------
-    ValueError
+    InputError
         If it is not that.
     """
     found = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
     if not found:
-        raise ValueError(f"{option}: found {text!r}, expected ROWSxCOLUMNS such as 256x192")
+        raise InputError(f"{option}: found {text!r}, expected ROWSxCOLUMNS such as 256x192")
     return int(found[1]), int(found[2])
 
 
@@ -37,7 +39,7 @@ def interval(option: str, text: str) -> tuple[float, float]:
 
     Raises
     ------
-    ValueError
+    InputError
         If it is not two numbers in order.
     """
     try:
@@ -45,7 +47,7 @@ def interval(option: str, text: str) -> tuple[float, float]:
     except ValueError:
         low, high = 1.0, 0.0
     if not low <= high:
-        raise ValueError(f"{option}: found {text!r}, expected LOW,HIGH such as -10,8")
+        raise InputError(f"{option}: found {text!r}, expected LOW,HIGH such as -10,8")
     return low, high
 
 
@@ -59,7 +61,7 @@ def pixel(text: str) -> float | tuple[float, float]:
 
     Raises
     ------
-    ValueError
+    InputError
         If it is neither.
     """
     try:
@@ -67,7 +69,7 @@ def pixel(text: str) -> float | tuple[float, float]:
     except ValueError:
         sizes = []
     if len(sizes) not in (1, 2):
-        raise ValueError(f"--pixel-size: found {text!r}, expected MM, or MM,MM of row and column")
+        raise InputError(f"--pixel-size: found {text!r}, expected MM, or MM,MM of row and column")
     return sizes[0] if len(sizes) == 1 else (sizes[0], sizes[1])
 
 
@@ -83,13 +85,13 @@ def memory_size(option: str, text: str) -> int:
 
     Raises
     ------
-    ValueError
+    InputError
         If it is not that, or less than a byte.
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip().lower())
     count = int(float(found[1]) * 1024 ** " kmgt".index(found[2] or " ")) if found else 0
     if count < 1:
-        raise ValueError(f"{option}: found {text!r}, expected a size such as 512M or 2.5G")
+        raise InputError(f"{option}: found {text!r}, expected a size such as 512M or 2.5G")
     return count
 
 
@@ -103,13 +105,13 @@ def volume_file(path: Path) -> None:
 
     Raises
     ------
-    ValueError
+    InputError
         If there is no such format.
     """
     from clra.io.volumes.volume_files import HDF5, TIFF
 
     expected = ", ".join((HDF5[0], *TIFF))
     if path.suffix.lower() == ".zarr":
-        raise ValueError(f"{path}: zarr volumes cannot be written yet, expected {expected}")
+        raise InputError(f"{path}: zarr volumes cannot be written yet, expected {expected}")
     if path.suffix.lower() not in HDF5 + TIFF:
-        raise ValueError(f"{path}: found suffix {path.suffix!r}, expected one of {expected}")
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {expected}")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model import trajectory
 from clra.model.gauge.gauge import sample_points, without_gauge
 from clra.model.geometry import ConeBeamGeometry
@@ -48,7 +49,7 @@ def paper_like(kind: str, views: int, shape: tuple[int, int]) -> ConeBeamGeometr
 
     Raises
     ------
-    ValueError
+    InputError
         If the kind is unknown or the number of views does not suit it.
     """
     paper = trajectory.PAPER
@@ -64,9 +65,9 @@ def paper_like(kind: str, views: int, shape: tuple[int, int]) -> ConeBeamGeometr
     if kind == "circular":
         return trajectory.circular(views, **common)
     if kind not in TRAJECTORIES:
-        raise ValueError(f"trajectory: found {kind!r}, expected one of {', '.join(TRAJECTORIES)}")
+        raise InputError(f"trajectory: found {kind!r}, expected one of {', '.join(TRAJECTORIES)}")
     if kind == "double-helix" and views % 2:
-        raise ValueError(f"views: found {views}, expected an even number for a double helix")
+        raise InputError(f"views: found {views}, expected an even number for a double helix")
     along = views // 2 if kind == "double-helix" else views
     fewer = _PAPER_VIEWS / along
     common["z_step"] = paper["z_step"] * height * fewer
@@ -92,11 +93,11 @@ def sample(kind: str, geometry: ConeBeamGeometry, seed: int = 0) -> Ellipsoids:
 
     Raises
     ------
-    ValueError
+    InputError
         If the kind is unknown.
     """
     if kind not in PHANTOMS:
-        raise ValueError(f"phantom: found {kind!r}, expected one of {', '.join(PHANTOMS)}")
+        raise InputError(f"phantom: found {kind!r}, expected one of {', '.join(PHANTOMS)}")
     cylinder = _cylinder(geometry)
     nz, _, nx = cylinder.shape
     radius, height = 0.5 * nx * cylinder.voxel_size, nz * cylinder.voxel_size
@@ -146,11 +147,11 @@ def simulated_motion(
 
     Raises
     ------
-    ValueError
+    InputError
         If the kind is unknown or a range is wrong.
     """
     if kind not in MOTIONS:
-        raise ValueError(f"motion: found {kind!r}, expected one of {', '.join(MOTIONS)}")
+        raise InputError(f"motion: found {kind!r}, expected one of {', '.join(MOTIONS)}")
     if kind == "none":
         return Motion.identity(geometry.views)
     part = 0.5 if kind == "both" else 1.0
@@ -198,11 +199,11 @@ def simulated_scan(
 
     Raises
     ------
-    ValueError
+    InputError
         If `noise` is not positive.
     """
     if noise is not None and not (math.isfinite(noise) and noise > 0):
-        raise ValueError(f"noise: found {noise:g} photons a pixel, expected more than 0")
+        raise InputError(f"noise: found {noise:g} photons a pixel, expected more than 0")
     radiographs = _Simulated(geometry.with_motion(motion), phantom, noise, seed)
     return Scan(radiographs, geometry, name=name, truth=motion)
 

@@ -93,7 +93,7 @@ def write_motion_file(
 
     Raises
     ------
-    ValueError
+    InputError
         If `confidence` does not fit the motion.
     OutputError
         If the file cannot be written.
@@ -116,7 +116,7 @@ def write_motion_file(
         if confidence is not None:
             values = np.asarray(confidence, np.float64)
             if values.shape != (motion.views,):
-                raise ValueError(
+                raise InputError(
                     f"confidence: found shape {values.shape}, expected ({motion.views},)"
                 )
             group["confidence"] = values

@@ -99,7 +99,7 @@ def write_scan(
 
     Raises
     ------
-    ValueError
+    InputError
         If `believed` is not of these views, or none.
     OutputError
         If the file cannot be written.

@@ -4,6 +4,8 @@ import re
 from functools import cache
 from pathlib import Path
 
+from clra.errors import InputError
+
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]+"([^"]+)"[^\n]*$', re.MULTILINE)
 
 
@@ -44,11 +46,11 @@ def source(name: str) -> str:
 
     Raises
     ------
-    ValueError
+    InputError
         If there is no such file.
     """
     if name not in names():
-        raise ValueError(f"no kernel file {name!r}; there are {', '.join(names())}")
+        raise InputError(f"no kernel file {name!r}; there are {', '.join(names())}")
     seen: set[str] = set()
 
     def paste(text: str) -> str:

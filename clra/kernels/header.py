@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 
 from clra import kernels
+from clra.errors import InputError
 
 _KERNEL = re.compile(r"^kernel\b.*\bvoid (\w+)\($")
 # By the house's rule an argument is one line: type, name, and what it is.
@@ -63,7 +64,7 @@ def signatures(file: str) -> tuple[Signature, ...]:
 
     Raises
     ------
-    ValueError
+    InputError
         If there is no such file, or an argument is not one line.
     """
     found: list[Signature] = []
@@ -76,7 +77,7 @@ def signatures(file: str) -> tuple[Signature, ...]:
                     break
                 argument = _ARGUMENT.match(declaration)
                 if argument is None:
-                    raise ValueError(f"{file}: found {declaration!r}, expected one argument")
+                    raise InputError(f"{file}: found {declaration!r}, expected one argument")
                 kind, name, meaning = argument.group("type", "name", "meaning")
                 arguments.append(Argument(kind.strip(), name, meaning or ""))
             found.append(Signature(kernel.group(1), file, tuple(arguments)))

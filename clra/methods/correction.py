@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.images.warp import Warp
@@ -43,7 +44,7 @@ def correct(
 
     Raises
     ------
-    ValueError
+    InputError
         If the motion is of another number of views.
     """
     stream = Stream(device, max_device_memory=max_device_memory, max_host_memory=max_host_memory)
@@ -53,7 +54,7 @@ def correct(
 def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
     """Do as :func:`correct`, errors included, on the device and within the memory of a stream."""
     if motion.views != scan.views:
-        raise ValueError(f"motion: found {motion.views} views, expected {scan.views}")
+        raise InputError(f"motion: found {motion.views} views, expected {scan.views}")
     if motion.cause == "source":
         warnings.warn(
             "radiographs are resampled as if their panel had moved, but it was the source: they "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.validation import panel_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class ConeBeamGeometry:
 
     Raises
     ------
-    ValueError
+    InputError
         If shapes disagree, a number is not finite, ``u`` and ``v`` are parallel, or the source
         lies in the panel's plane.
     """
@@ -169,11 +170,11 @@ class ConeBeamGeometry:
 
         Raises
         ------
-        ValueError
+        InputError
             If the motion is of another number of views.
         """
         if motion.views != self.views:
-            raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
+            raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
             return ConeBeamGeometry(
                 source=self.source + self.source_displacement(motion),
@@ -225,13 +226,13 @@ class ConeBeamGeometry:
 
         Raises
         ------
-        ValueError
+        InputError
             If it is less than 1 or more than the panel has.
         """
         factor = whole("factor", factor)
         rows, columns = self.rows // factor, self.columns // factor
         if not rows or not columns:
-            raise ValueError(
+            raise InputError(
                 f"factor: found {factor}, expected at most {min(self.shape)} to bin "
                 f"{self.rows} x {self.columns} pixels"
             )
@@ -288,12 +289,12 @@ class ConeBeamGeometry:
 
         Raises
         ------
-        ValueError
+        InputError
             If the points are of another shape.
         """
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"points: found shape {points.shape}, expected (n, 3)")
+            raise InputError(f"points: found shape {points.shape}, expected (n, 3)")
         rotation = self._to_pixels()
         # Differences first: P (x, 1) would cancel digits where the source is far away.
         image = (points - self.source[:, None, :]) @ rotation.transpose(0, 2, 1)
@@ -324,12 +325,12 @@ class ConeBeamGeometry:
 
         Raises
         ------
-        ValueError
+        InputError
             If the vectors are of another shape, or no geometry.
         """
         numbers = np.asarray(vectors, dtype=np.float64)
         if numbers.ndim != 2 or numbers.shape[1] != 12:
-            raise ValueError(f"vectors: found shape {numbers.shape}, expected (views, 12)")
+            raise InputError(f"vectors: found shape {numbers.shape}, expected (views, 12)")
         source, detector, u, v = np.split(numbers, 4, axis=1)
         return cls(source=source, detector=detector, u=u, v=v, shape=shape)
 
@@ -337,7 +338,7 @@ class ConeBeamGeometry:
 def _refuse(bad: NDArray[np.bool_], found: str, expected: str) -> None:
     """Raise for the first view for which `bad` holds."""
     if bad.any():
-        raise ValueError(f"{found} in view {int(np.argmax(bad))}, expected {expected}")
+        raise InputError(f"{found} in view {int(np.argmax(bad))}, expected {expected}")
 
 
 def _norm(vectors: Floats) -> Floats:

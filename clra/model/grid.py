@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.validation import positive, whole
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class VolumeGrid:
 
     Raises
     ------
-    ValueError
+    InputError
         If a size is not positive or a number is not finite.
     """
 
@@ -49,10 +50,10 @@ class VolumeGrid:
 
     def __post_init__(self) -> None:
         if np.shape(self.shape) != (3,):
-            raise ValueError(f"shape: found {self.shape!r}, expected (nz, ny, nx)")
+            raise InputError(f"shape: found {self.shape!r}, expected (nz, ny, nx)")
         size = positive("voxel_size", self.voxel_size)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
-            raise ValueError(f"centre: found {self.centre!r}, expected finite (x, y, z) in mm")
+            raise InputError(f"centre: found {self.centre!r}, expected finite (x, y, z) in mm")
         nz, ny, nx = (whole("shape", n) for n in self.shape)
         x, y, z = (float(c) for c in self.centre)
         object.__setattr__(self, "shape", (nz, ny, nx))
@@ -79,12 +80,12 @@ class VolumeGrid:
 
         Raises
         ------
-        ValueError
+        InputError
             If these are not one or more of the grid's planes.
         """
         nz, ny, nx = self.shape
         if not 0 <= start < stop <= nz:
-            raise ValueError(f"slab: found {start}:{stop}, expected 0 <= start < stop <= {nz}")
+            raise InputError(f"slab: found {start}:{stop}, expected 0 <= start < stop <= {nz}")
         return self._moved((stop - start, ny, nx), self.voxel_size, (0, 0, start))
 
     def binned(self, factor: int = 2) -> VolumeGrid:
@@ -94,12 +95,12 @@ class VolumeGrid:
 
         Raises
         ------
-        ValueError
+        InputError
             If `factor` is less than 1 or more than there are voxels along an axis.
         """
         factor = whole("factor", factor)
         if factor > min(self.shape):
-            raise ValueError(f"factor: found {factor}, expected at most {min(self.shape)}")
+            raise InputError(f"factor: found {factor}, expected at most {min(self.shape)}")
         nz, ny, nx = (n // factor for n in self.shape)
         return self._moved((nz, ny, nx), self.voxel_size * factor, (0, 0, 0))
 
@@ -108,12 +109,12 @@ class VolumeGrid:
 
         Raises
         ------
-        ValueError
+        InputError
             If no plane is left.
         """
         nz, ny, nx = self.shape
         if nz + 2 * planes < 1:
-            raise ValueError(f"planes: found {planes}, expected more than {-nz / 2:g}")
+            raise InputError(f"planes: found {planes}, expected more than {-nz / 2:g}")
         return self._moved((nz + 2 * planes, ny, nx), self.voxel_size, (0, 0, -planes))
 
     def _moved(
@@ -151,17 +152,17 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
 
     Raises
     ------
-    ValueError
+    InputError
         If a view does not see the axis, or sees it end on.
     """
     magnified = geometry.source_to_axis / geometry.source_to_detector
     if magnified.min() <= 0:
-        raise ValueError(f"view {int(magnified.argmin())}: the axis lies behind the source")
+        raise InputError(f"view {int(magnified.argmin())}: the axis lies behind the source")
     voxel = float(np.median(np.linalg.norm(geometry.u, axis=1) * magnified))
     nearest = field_radii(geometry)
     radius = float(nearest.min())
     if not radius > 0:
-        raise ValueError(
+        raise InputError(
             f"view {int(nearest.argmin())} does not see the rotation axis: give a grid"
         )
     low, high = _axis_range(geometry)
@@ -208,7 +209,7 @@ def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:
             ends.append((row * matrices[:, 2, 3] - matrices[:, 1, 3]) / slope)
     low, high = np.sort(ends, axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise ValueError("the rows of a view run along the rotation axis: give a grid")
+        raise InputError("the rows of a view run along the rotation axis: give a grid")
     heights = np.sort(np.concatenate([low, high]))
     middles = 0.5 * (heights[1:] + heights[:-1])
     seen = np.searchsorted(np.sort(low), middles) - np.searchsorted(np.sort(high), middles)

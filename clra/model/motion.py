@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.validation import column, same_views, selection, whole
 
 Floats = NDArray[np.float64]
@@ -37,7 +38,7 @@ class Motion:
 
     Raises
     ------
-    ValueError
+    InputError
         If lengths disagree, a number is not finite, a magnification is not positive or `cause` is
         none of the two.
     """
@@ -56,7 +57,7 @@ class Motion:
         cause: str = "panel",
     ) -> None:
         if cause not in CAUSES:
-            raise ValueError(f"cause: found {cause!r}, expected one of {CAUSES}")
+            raise InputError(f"cause: found {cause!r}, expected one of {CAUSES}")
         object.__setattr__(self, "cause", cause)
         if magnification is None:
             magnification = np.ones(np.shape(shift_u))
@@ -65,7 +66,7 @@ class Motion:
         object.__setattr__(self, "magnification", column("magnification", magnification, "views"))
         same_views(shift_u=self.shift_u, shift_v=self.shift_v, magnification=self.magnification)
         if self.magnification.min() <= 0:
-            raise ValueError(
+            raise InputError(
                 f"magnification: found {self.magnification.min()}, expected positive numbers"
             )
 
@@ -110,11 +111,11 @@ class Motion:
 
         Raises
         ------
-        ValueError
+        InputError
             If it is of another number of views.
         """
         if residual.views != self.views:
-            raise ValueError(f"residual: found {residual.views} views, expected {self.views}")
+            raise InputError(f"residual: found {residual.views} views, expected {self.views}")
         m = residual.magnification
         return Motion(
             shift_u=m * self.shift_u + residual.shift_u,

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.bad_pixels import Patches
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
@@ -60,7 +61,7 @@ class Scan:
 
     Raises
     ------
-    ValueError
+    InputError
         If projections, geometry, truth or mask disagree, or `kind` is none of the two.
     """
 
@@ -75,20 +76,20 @@ class Scan:
         expected = (self.geometry.views, *self.geometry.shape)
         found = tuple(self.projections.shape)
         if found != expected:
-            raise ValueError(
+            raise InputError(
                 f"{self.name}: projections: found shape {found}, "
                 f"expected {expected} as in the geometry"
             )
         if self.kind not in KINDS:
-            raise ValueError(f"{self.name}: kind: found {self.kind!r}, expected one of {KINDS}")
+            raise InputError(f"{self.name}: kind: found {self.kind!r}, expected one of {KINDS}")
         if self.truth is not None and self.truth.views != self.views:
-            raise ValueError(
+            raise InputError(
                 f"{self.name}: truth: found {self.truth.views} views, expected {self.views}"
             )
         if self.mask is not None:
             mask = np.array(self.mask, dtype=np.bool_)
             if mask.shape != self.geometry.shape or not mask.any():
-                raise ValueError(
+                raise InputError(
                     f"{self.name}: mask: found shape {mask.shape} with {mask.sum()} pixels to use, "
                     f"expected shape {self.geometry.shape} and at least one"
                 )
@@ -129,11 +130,11 @@ class Scan:
 
         Raises
         ------
-        ValueError
+        InputError
             If the range is wrong or a pixel is not finite.
         """
         if not 0 <= start <= stop <= self.views:
-            raise ValueError(
+            raise InputError(
                 f"{self.name}: views: found {start}:{stop}, expected within 0:{self.views}"
             )
         pixels = np.ascontiguousarray(self.projections[start:stop], dtype=np.float32)
@@ -148,7 +149,7 @@ class Scan:
         finite = np.isfinite(pixels).all(axis=(1, 2))
         if not finite.all():
             view = start + int(np.argmin(finite))
-            raise ValueError(f"{self.name}: view {view}: found a pixel that is no finite number")
+            raise InputError(f"{self.name}: view {view}: found a pixel that is no finite number")
         return pixels
 
     def _warn_of_dark(self, transmission: NDArray[np.float32]) -> None:

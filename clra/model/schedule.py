@@ -9,6 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
+from clra.errors import InputError
+
 _LEVELS = {"FR": 1, "HR": 2, "QR": 4, "ER": 8}
 _STAGE = re.compile(r"([1-9][0-9]?)([FHQE]R)")
 _EXPECTED = (
@@ -70,7 +72,7 @@ def level_name(level: int) -> str:
     for name, factor in _LEVELS.items():
         if factor == level:
             return name
-    raise ValueError(f"level: found {level}, expected one of {tuple(_LEVELS.values())}")
+    raise InputError(f"level: found {level}, expected one of {tuple(_LEVELS.values())}")
 
 
 def level_factor(name: str) -> int:
@@ -94,14 +96,14 @@ def parse_levels(text: str) -> tuple[int, ...]:
 
     Raises
     ------
-    ValueError
+    InputError
         If the text is no such cycle.
     """
     if text == "auto":
         text = "QR-HR-FR"
     factors = tuple(_LEVELS.get(name, 0) for name in str(text).upper().split("-"))
     if factors[-1] != 1 or any(a != 2 * b for a, b in pairwise(factors)):
-        raise ValueError(
+        raise InputError(
             f"levels: found {text!r}, expected resolutions that double up to full, such as "
             "'QR-HR-FR' or 'ER-QR-HR-FR'"
         )
@@ -127,7 +129,7 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
 
     Raises
     ------
-    ValueError
+    InputError
         If the text is no schedule; the message says what one looks like.
     """
     if text == "auto":
@@ -139,7 +141,7 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
     for part in str(text).upper().split("-"):
         match = _STAGE.fullmatch(part)
         if match is None:
-            raise ValueError(f"schedule: found {text!r}, {_EXPECTED}")
+            raise InputError(f"schedule: found {text!r}, {_EXPECTED}")
         stages.append(Stage(_LEVELS[match[2]], int(match[1]), int(match[1])))
     return tuple(stages)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.validation import whole
@@ -49,7 +50,7 @@ def ordered_subsets(
 
     Raises
     ------
-    ValueError
+    InputError
         If `count` is not 1 to the number of views, or so large that some subset misses a part of
         the sample.
     """
@@ -62,10 +63,10 @@ def ordered_subsets(
         return [np.arange(geometry.views)]
     count = whole("subsets", count)
     if count > geometry.views:
-        raise ValueError(f"subsets: found {count}, expected at most {geometry.views}, one a view")
+        raise InputError(f"subsets: found {count}, expected at most {geometry.views}, one a view")
     subsets = sample.shared_out(count)
     if subsets is None:
-        raise ValueError(
+        raise InputError(
             f"subsets: found {count}, expected fewer: one of them does not see all of the sample"
         )
     return subsets

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.validation import finite, positive, whole
 
@@ -62,7 +63,7 @@ def circular(
 
     Raises
     ------
-    ValueError
+    InputError
         If there is no view, a number is not finite, or a distance not positive.
     """
     views = whole("views", views)
@@ -98,7 +99,7 @@ def helix(
 
     Raises
     ------
-    ValueError
+    InputError
         As `circular` does.
     """
     views = whole("views", views)
@@ -141,7 +142,7 @@ def double_helix(
 
     Raises
     ------
-    ValueError
+    InputError
         As `circular` does, and for another `second`.
     """
     views = whole("views_per_helix", views_per_helix)
@@ -151,7 +152,7 @@ def double_helix(
     elif second == "return":
         later = angles + views * angle_step
     else:
-        raise ValueError(f"second: found {second!r}, expected 'half-turn' or 'return'")
+        raise InputError(f"second: found {second!r}, expected 'half-turn' or 'return'")
     z = _heights(views, z_step)
     return _around(
         finite("start", start) + np.concatenate([angles, later]),
@@ -185,7 +186,7 @@ def space_filling(
 
     Raises
     ------
-    ValueError
+    InputError
         As `circular` does, and for a `z_step` of 0 without an `angle_step`.
     """
     if angle_step is None:
@@ -222,14 +223,14 @@ def lattice_angle(source_to_axis: float, z_step: float, near: float = _NEAR) -> 
 
     Raises
     ------
-    ValueError
+    InputError
         If there is no rise, or `near` is not between 0 and pi.
     """
     rise = abs(finite("z_step", z_step)) / positive("source_to_axis", source_to_axis)
     if rise == 0:
-        raise ValueError("z_step: found 0, expected a rise: give angle_step for a circle")
+        raise InputError("z_step: found 0, expected a rise: give angle_step for a circle")
     if not 0 < near < math.pi:
-        raise ValueError(f"near: found {near}, expected an angle between 0 and pi")
+        raise InputError(f"near: found {near}, expected an angle between 0 and pi")
     hexagonal = math.sqrt(4 * math.pi * rise / math.sqrt(3))
     # No neighbour farther along z than the hexagonal distance can be the nearest.
     steps = np.arange(1, math.ceil(hexagonal / rise) + 1)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
+
 Floats = NDArray[np.float64]
 
 
@@ -19,7 +21,7 @@ def whole(name: str, value: Any) -> int:
     except TypeError:
         raise TypeError(f"{name}: found {value!r}, expected a whole number") from None
     if number < 1:
-        raise ValueError(f"{name}: found {number}, expected at least 1")
+        raise InputError(f"{name}: found {number}, expected at least 1")
     return number
 
 
@@ -27,7 +29,7 @@ def finite(name: str, value: Any) -> float:
     """Check a finite number."""
     number = float(value)
     if not math.isfinite(number):
-        raise ValueError(f"{name}: found {number}, expected a finite number")
+        raise InputError(f"{name}: found {number}, expected a finite number")
     return number
 
 
@@ -35,7 +37,7 @@ def positive(name: str, value: Any) -> float:
     """Check a finite number above zero."""
     number = float(value)
     if not (math.isfinite(number) and number > 0):
-        raise ValueError(f"{name}: found {number}, expected a positive number")
+        raise InputError(f"{name}: found {number}, expected a positive number")
     return number
 
 
@@ -44,7 +46,7 @@ def panel_shape(shape: Any) -> tuple[int, int]:
     try:
         rows, columns = shape
     except (TypeError, ValueError):
-        raise ValueError(f"shape: found {shape!r}, expected (rows, columns)") from None
+        raise InputError(f"shape: found {shape!r}, expected (rows, columns)") from None
     return whole("shape", rows), whole("shape", columns)
 
 
@@ -55,7 +57,7 @@ def same_views(**columns: Floats) -> None:
     for name in others:
         found = len(columns[name])
         if found != views:
-            raise ValueError(f"{name}: found {found} views, expected {views} as in {first}")
+            raise InputError(f"{name}: found {found} views, expected {views} as in {first}")
 
 
 def selection(index: slice | ArrayLike) -> slice | NDArray[Any]:
@@ -70,7 +72,7 @@ def vectors(name: str, value: ArrayLike, each: str) -> Floats:
     """Check and copy finite vectors (x, y, z), one for each of something; read-only."""
     array = np.array(value, dtype=np.float64, order="C")
     if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-        raise ValueError(f"{name}: found shape {array.shape}, expected ({each}, 3), at least one")
+        raise InputError(f"{name}: found shape {array.shape}, expected ({each}, 3), at least one")
     return _finite_array(name, array, each)
 
 
@@ -78,7 +80,7 @@ def column(name: str, value: ArrayLike, each: str) -> Floats:
     """Check and copy finite numbers, one for each of something; read-only."""
     array = np.array(value, dtype=np.float64, order="C")
     if array.ndim != 1 or not len(array):
-        raise ValueError(f"{name}: found shape {array.shape}, expected ({each},), at least one")
+        raise InputError(f"{name}: found shape {array.shape}, expected ({each},), at least one")
     return _finite_array(name, array, each)
 
 
@@ -89,7 +91,7 @@ def believed_views(believed: ArrayLike, views: int) -> NDArray[np.bool_]:
     """
     array = np.asarray(believed)
     if array.dtype != np.bool_ or array.shape != (views,) or not array.any():
-        raise ValueError(
+        raise InputError(
             f"believed: found {array.shape} of {array.dtype}, {array.sum()} in all, "
             f"expected ({views},) of bool with one or more"
         )
@@ -100,7 +102,7 @@ def _finite_array(name: str, array: Floats, each: str) -> Floats:
     bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
     if bad.any():
         first = int(np.argmax(bad))
-        raise ValueError(
+        raise InputError(
             f"{name}: found {array[first]} at {first} of the {each}, expected finite numbers"
         )
     array.flags.writeable = False

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.validation import vectors
 
@@ -51,11 +52,11 @@ def match_views(geometry: ConeBeamGeometry, other: ConeBeamGeometry, points: Arr
 
     Raises
     ------
-    ValueError
+    InputError
         If the panels differ in rows or columns.
     """
     if geometry.shape != other.shape:
-        raise ValueError(
+        raise InputError(
             f"panel: found {other.rows} x {other.columns} pixels, expected {geometry.rows} x "
             f"{geometry.columns} as in the scan"
         )

@@ -62,7 +62,7 @@ class AlignmentStep:
 
     Raises
     ------
-    ValueError
+    InputError
         If an argument is none of the above.
 
     References
@@ -131,7 +131,7 @@ class AlignmentStep:
 
         Raises
         ------
-        ValueError
+        InputError
             If views or panel differ, or the grid reaches behind a source.
         """
         # The projectors first: only they may refuse the grid, and then nothing has changed.
@@ -174,7 +174,7 @@ class AlignmentStep:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an argument is none of the above.
         """
         build.check_queue(queue, self._context)

@@ -5,9 +5,7 @@ import pyopencl as cl
 import pytest
 
 from clra.app.exit_status import InterruptedCommandError, _plain_warnings, verdict
-from clra.errors import InputError, OutputError
-from clra.ops.runtime.build import KernelBuildError
-from clra.ops.runtime.devices import NoDeviceError
+from clra.errors import DeviceError, InputError, KernelBuildError, OutputError
 from clra.ops.streaming.memory import DeviceMemoryError
 
 
@@ -20,7 +18,7 @@ from clra.ops.streaming.memory import DeviceMemoryError
         (OutputError.writing("v.h5", errno.ENOSPC, ""), 1, "free some space"),
         (OSError(errno.ENOSPC, "No space left on device", "v.h5"), 1, "free some space"),
         (PermissionError(errno.EACCES, "Permission denied", "v.h5"), 1, "v.h5"),
-        (NoDeviceError("no OpenCL device"), 1, "no OpenCL device"),
+        (DeviceError("no OpenCL device"), 1, "no OpenCL device"),
         (DeviceMemoryError("too large"), 1, "too large"),
         (KernelBuildError("kernel a.cl does not build\nlog\nlog"), 1, "--device"),
         (MemoryError(), 1, "clra info"),

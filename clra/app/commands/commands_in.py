@@ -53,7 +53,7 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
     from clra.app.cost import costs_of, costs_table
     from clra.app.scan_description import Facts, table
     from clra.app.speed import Speed, measure
-    from clra.ops.runtime.devices import NoDeviceError
+    from clra.errors import DeviceError
 
     limits = memory.limits()
     opened = reading.scan(scan)
@@ -61,7 +61,7 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
     try:
         with console.progress() as report:
             speed = measure(opened.geometry, console.device, report, **limits)
-    except NoDeviceError as error:
+    except DeviceError as error:
         if console.device:
             raise
         warnings.warn(f"no times: {error}", stacklevel=1)

@@ -9,6 +9,7 @@ import typer
 
 from clra.app.commands.reconstruct import reconstruct
 from clra.app.console import Console, Memory, Reading, command
+from clra.errors import InputError
 
 ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
 
@@ -114,11 +115,11 @@ def align(
     (parse_levels if method == "imgr" else parse_schedule)(schedule)
     if volume is not None:
         if method != "imgr":
-            raise ValueError(f"--volume: found it with --method {method}, expected imgr")
+            raise InputError(f"--volume: found it with --method {method}, expected imgr")
         volume_file(volume)
     if start is not None and (autofocus or reference is not None):
         other = "--autofocus" if autofocus else "--reference"
-        raise ValueError(f"--start, {other}: found both, expected one of them")
+        raise InputError(f"--start, {other}: found both, expected one of them")
     limits = memory.limits()
     ensure_writable(out, keep=(scan, reference))  # it may be --start: that is read by then
     kept = [scan, reference, start, out]

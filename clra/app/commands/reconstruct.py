@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from clra.app.console import Console, Memory, Reading
+from clra.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -114,11 +115,11 @@ def reconstruct(
     volume_file(out)
     limits = memory.limits()
     if motion is not None and align:
-        raise ValueError("--motion, --align: found both, expected one of them")
+        raise InputError("--motion, --align: found both, expected one of them")
     if method not in METHODS:
-        raise ValueError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
+        raise InputError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
     if iterating.resume and method != "imgr":
-        raise ValueError(f"--resume: found it with --method {method}, expected imgr")
+        raise InputError(f"--resume: found it with --method {method}, expected imgr")
     options = iterating.options()
     opened = reading.scan(scan)
     grid = default_grid(opened.cropped().geometry)

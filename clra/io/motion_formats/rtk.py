@@ -51,7 +51,7 @@ def write_rtk_geometry(path: str | os.PathLike[str], geometry: ConeBeamGeometry)
 
     Raises
     ------
-    ValueError
+    InputError
         If a panel is skewed: RTK cannot express it.
     OutputError
         If the file cannot be written.
@@ -142,7 +142,7 @@ def _rtk_numbers(geometry: ConeBeamGeometry) -> Floats:
     skew = np.abs(_dot(row, column))
     if skew.max() > _SKEW:
         view = int(np.argmax(skew))
-        raise ValueError(
+        raise InputError(
             f"geometry: found u and v {np.rad2deg(np.arccos(skew[view])):.6f} degrees apart in "
             f"view {view}, expected 90: RTK knows only rectangular panels"
         )

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.io.atomic import atomic_path
 from clra.io.nxtomo.clra_group import KIND_ATTRIBUTE, KINDS, write_additions
 from clra.io.nxtomo.geometry_fields import Fields, fields_of, top_down
@@ -85,21 +86,21 @@ def write_nxtomo(
 
     Raises
     ------
-    ValueError
+    InputError
         If the arrays do not fit the geometry, or no radiograph is to be used.
     OutputError
         If the file cannot be written.
     """
     if kind not in KINDS:
-        raise ValueError(f"kind: found {kind!r}, expected one of {KINDS}")
+        raise InputError(f"kind: found {kind!r}, expected one of {KINDS}")
     expected = (geometry.views, *geometry.shape)
     if tuple(radiographs.shape) != expected:
-        raise ValueError(f"radiographs: found shape {radiographs.shape}, expected {expected}")
+        raise InputError(f"radiographs: found shape {radiographs.shape}, expected {expected}")
     ordered = ((DARK, darks), (FLAT, flats), (PROJECTION, radiographs), (FLAT, flats_after))
     parts = [(role, part) for role, part in ordered if part is not None]
     for _, part in parts:
         if tuple(part.shape[1:]) != geometry.shape:
-            raise ValueError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
+            raise InputError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
     if believed is None:
         believed = np.ones(geometry.views, np.bool_)
     believed = believed_views(believed, geometry.views)

@@ -15,6 +15,8 @@ import h5py
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clra.errors import InputError
+
 
 def reserve(
     group: h5py.Group, name: str, shape: tuple[int, ...], dtype: DTypeLike
@@ -74,13 +76,13 @@ class SlabWriter:
 
         Raises
         ------
-        ValueError
+        InputError
             If the part does not fit.
         OSError
             If the disk does not take it.
         """
         if part.shape[1:] != self.shape[1:] or not 0 <= start <= self.shape[0] - len(part):
-            raise ValueError(
+            raise InputError(
                 f"part: found shape {part.shape} at {start}, expected to fit into {self.shape}"
             )
         view = np.ascontiguousarray(part, self.dtype).reshape(-1).view(np.uint8).data

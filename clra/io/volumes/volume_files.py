@@ -93,13 +93,13 @@ def write_volume(
 
     Raises
     ------
-    ValueError
+    InputError
         If volume and grid disagree.
     OutputError
         If the file cannot be written.
     """
     if tuple(volume.shape) != grid.shape:
-        raise ValueError(f"volume: found shape {volume.shape}, expected {grid.shape} as in grid")
+        raise InputError(f"volume: found shape {volume.shape}, expected {grid.shape} as in grid")
     planes, rows, columns = grid.shape
     step = max(1, _PIECE // (4 * rows * columns))
     with open_volume(path, grid, units=units) as writer:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+from clra.errors import InputError
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
@@ -86,7 +87,7 @@ def align(
 
     Raises
     ------
-    ValueError
+    InputError
         If an option is none of its choices or the scan has less than two views.
     AlignmentInterrupted
         On Ctrl-C after at least one iteration; carries the result so far.
@@ -99,10 +100,10 @@ def align(
     _check(scan, method, estimate, gauge)
     for name, given in (("motion", motion), ("truth", truth)):
         if given is not None and given.views != scan.views:
-            raise ValueError(f"{name}: found {given.views} views, expected {scan.views}")
+            raise InputError(f"{name}: found {given.views} views, expected {scan.views}")
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
-        raise ValueError(f"reference, motion: found {found}, expected one of them")
+        raise InputError(f"reference, motion: found {found}, expected one of them")
     # What the mask leaves of the panel is aligned as a panel of its own.
     whole, scan = scan, scan.cropped()
     aside = whole.window_aside
@@ -169,10 +170,10 @@ def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> Al
 
 def _check(scan: Scan, method: str, estimate: str, gauge: str) -> None:
     if method not in METHODS:
-        raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
+        raise InputError(f"method: found {method!r}, expected one of {METHODS}")
     if estimate not in ESTIMATES:
-        raise ValueError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
+        raise InputError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
     if gauge not in GAUGES:
-        raise ValueError(f"gauge: found {gauge!r}, expected one of {GAUGES}")
+        raise InputError(f"gauge: found {gauge!r}, expected one of {GAUGES}")
     if scan.views < 2:
-        raise ValueError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")
+        raise InputError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.methods.alignment.align import align
 from clra.model.angular_coverage import covered
 from clra.model.detector_pose import with_panel
@@ -108,14 +109,14 @@ def autofocus(
 
     Raises
     ------
-    ValueError
+    InputError
         If views cover less than a turn, the best lies at the end of what is searched, or slices
         have no structure.
     """
     angle = covered(scan.geometry)
     if angle < 2 * math.pi:
         # Slices of half a turn are sharpest with a panel tilted by 3 degrees too much.
-        raise ValueError(
+        raise InputError(
             f"{scan.name}: found views over {math.degrees(angle):.0f} degrees, expected a whole "
             "turn to find the axis and the panel's tilt by"
         )
@@ -220,9 +221,9 @@ def _searched(slices: "_Slices", scan: Scan) -> tuple[float, float]:
     turned = sharpest([(offsets[best], tilt) for tilt in _TILTS], len(offsets))
     slices.stream.report("auto-focus: searching", total, total)
     if not slices.structure:
-        raise ValueError(f"{scan.name}: found no structure in any slice, expected a sample")
+        raise InputError(f"{scan.name}: found no structure in any slice, expected a sample")
     if best in (0, len(offsets) - 1):
-        raise ValueError(
+        raise InputError(
             f"{scan.name}: found slices still getting sharper at an offset of "
             f"{offsets[best]:.4g} pixels, expected the axis nearer to where the geometry has it"
         )

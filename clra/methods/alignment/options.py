@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clra.errors import InputError
 from clra.methods.alignment.acceleration import Anderson
 from clra.methods.alignment.reprojection import SPREAD, registration_for
 from clra.model.scan import Scan
@@ -62,7 +63,7 @@ class Solver:
 
     def __post_init__(self) -> None:
         if self.estimator not in ESTIMATORS:
-            raise ValueError(f"estimator: found {self.estimator!r}, expected one of {ESTIMATORS}")
+            raise InputError(f"estimator: found {self.estimator!r}, expected one of {ESTIMATORS}")
 
     @classmethod
     def paper(cls) -> "Solver":

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
+from clra.errors import InputError
 from clra.methods.alignment.rejected_views import outliers
 from clra.methods.alignment.reprojection import (
     Registered,
@@ -143,20 +144,20 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
 
     Raises
     ------
-    ValueError
+    InputError
         If the panels differ or fewer than five reference views have a view alike.
     """
     points = sample_points(default_grid(scan.geometry), count=_POINTS)
     try:
         match = match_views(scan.geometry, reference.geometry, points)
     except ValueError as error:
-        raise ValueError(f"{reference.name}: {error}") from error
+        raise InputError(f"{reference.name}: {error}") from error
     # One pair a view, in order of time.
     order = np.lexsort((match.distance, match.views))
     first = np.concatenate([[True], np.diff(match.views[order]) > 0])
     pairs = order[first & (match.distance[order] <= _ALIKE)]
     if len(pairs) < _FEWEST:
-        raise ValueError(
+        raise InputError(
             f"{reference.name}: found {len(pairs)} views that look like one of {scan.name} to "
             f"within {_ALIKE:g} pixels (the nearest: {match.distance.min():.3g} pixels), expected "
             f"{_FEWEST} or more"
@@ -177,7 +178,7 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
     )
     good = ~outliers(found.correlation)
     if good.sum() < _FEWEST:
-        raise ValueError(
+        raise InputError(
             f"{reference.name}: found {good.sum()} views that could be registered, expected "
             f"{_FEWEST} or more"
         )

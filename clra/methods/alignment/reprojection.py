@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
@@ -101,12 +102,12 @@ def registration_for(
 
     Raises
     ------
-    ValueError
+    InputError
         If radiographs of the level are too small to be registered.
     """
     views, rows, columns = radiographs.shape
     if min(rows, columns) < SMALLEST:
-        raise ValueError(
+        raise InputError(
             f"{scan.name}: panel: found {scan.geometry.rows} x {scan.geometry.columns} pixels, "
             f"{rows} x {columns} at {level_name(radiographs.level)}, expected at least {SMALLEST} "
             "rows and columns there to register; start at a finer level, such as with schedule 4FR"

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.methods.alignment.limits import far_motion, lost_features, warned
 from clra.methods.alignment.rejected_views import from_neighbours, odd_radiographs, outliers
 from clra.methods.alignment.reprojection import Registered, with_margin
@@ -94,7 +95,7 @@ def imgr(
 
     Raises
     ------
-    ValueError
+    InputError
         If an option is none of the above.
     ReconstructionInterrupted
         On Ctrl-C after at least one level.
@@ -107,9 +108,9 @@ def imgr(
     factors = parse_levels(levels)
     osem = osem or OrderedSubsets()
     if not isinstance(osem.initial, str):
-        raise ValueError("initial: found a volume, expected 'fbp' or 'uniform' for imgr")
+        raise InputError("initial: found a volume, expected 'fbp' or 'uniform' for imgr")
     if align and scan.views < 2:
-        raise ValueError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")
+        raise InputError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")
     cycles = cycles or (_CYCLES if align else _CYCLES_UNALIGNED)
     start = motion or Motion.identity(scan.views)
     run = _Run(stream, scan, with_margin(grid), factors, align, scale, anchor, osem, truth, start)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
@@ -55,7 +56,7 @@ def iterate(
 
     Raises
     ------
-    ValueError
+    InputError
         If an option is unknown or wrong.
     """
     osem, cycle = sorted_options(method, options)
@@ -94,7 +95,7 @@ def sorted_options(
 
     Raises
     ------
-    ValueError
+    InputError
         If the method has no such option.
     """
     subsets = tuple(f.name for f in fields(OrderedSubsets)) if method in METHODS else ()
@@ -102,7 +103,7 @@ def sorted_options(
     for name in options:
         if name not in subsets + multigrid:
             known = ", ".join(subsets + multigrid) or "none"
-            raise ValueError(f"{name}: found an option that {method} does not have, it has {known}")
+            raise InputError(f"{name}: found an option that {method} does not have, it has {known}")
     return (
         OrderedSubsets(**{k: v for k, v in options.items() if k in subsets}),
         {k: v for k, v in options.items() if k in multigrid},
@@ -114,7 +115,7 @@ def _widened(osem: OrderedSubsets, grid: VolumeGrid, wide: VolumeGrid) -> Ordere
     if isinstance(osem.initial, str):
         return osem
     if tuple(osem.initial.shape) != grid.shape:
-        raise ValueError(
+        raise InputError(
             f"initial: found shape {osem.initial.shape}, expected {grid.shape} as in the grid"
         )
     margin = (wide.shape[0] - grid.shape[0]) // 2

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from clra.errors import InputError
 from clra.methods.truncation import AT_BORDER, profiles
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -63,7 +64,7 @@ def katsevich(
 
     Raises
     ------
-    ValueError
+    InputError
         If the trajectory is no helix, the panel shorter than the Tam-Danielsson window, the sample
         wider than the field of view, or the helix too short for any of the grid; the message says
         what would do.
@@ -140,7 +141,7 @@ def exact_helices(radiographs: Radiographs, geometry: ConeBeamGeometry, grid: Vo
 
     Raises
     ------
-    ValueError
+    InputError
         As :func:`katsevich` does.
     """
     fitted = fit_helices(geometry)
@@ -160,7 +161,7 @@ def _refuse_short(helices: list[Helix], grid: VolumeGrid, radius: float) -> None
         if ((np.maximum(low, 0) <= np.minimum(high, planes - 1)) & np.isfinite(low)).any():
             return
     z = [end for helix in helices for end in (helix.z, helix.z + helix.views * helix.z_step)]
-    raise ValueError(
+    raise InputError(
         f"grid: found heights {grid.coordinates()[2][0]:.4g} to {grid.coordinates()[2][-1]:.4g} mm "
         f"of which the helix, {min(z):.4g} to {max(z):.4g} mm, holds no pi-interval, expected more "
         "turns, a smaller pitch or another grid"
@@ -182,7 +183,7 @@ def _refuse_wide_sample(
     if cut > AT_BORDER * seen.max():
         # As wide as a round sample on the axis with the same line integrals would be.
         width = 2 * radius / math.sqrt(max(1 - (cut / most) ** 2, 1e-2))
-        raise ValueError(
+        raise InputError(
             f"radiographs: the sample reaches beyond the field of view of {2 * radius:.4g} mm "
             f"(line integrals of {cut:.3g} at its border, {most:.3g} inside), expected a field of "
             f"view of about {width:.4g} mm or a smaller sample; or use method 'fbp'"

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.helix.fit import fit_helices
 from clra.model.helix.gaps import completed
 from clra.model.scan import Scan
@@ -31,7 +32,7 @@ def without_gaps(scan: Scan, believed: NDArray[np.bool_] | None = None) -> Scan:
 
     Raises
     ------
-    ValueError
+    InputError
         If the trajectory is no helix, or no view of one of several is believed.
     """
     geometry, views = completed(scan.geometry)
@@ -66,7 +67,7 @@ class _Filled:
             here = np.arange(part.start, part.stop)
             kept = here[views[part] >= 0]
             if not len(kept):
-                raise ValueError(
+                raise InputError(
                     f"believed: found none of the views {part.start} to {part.stop - 1}, expected "
                     "at least one of each helix"
                 )

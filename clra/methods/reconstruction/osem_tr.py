@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -63,7 +64,7 @@ class OrderedSubsets:
 
     Raises
     ------
-    ValueError
+    InputError
         If an option is none of the above.
 
     References
@@ -86,15 +87,15 @@ class OrderedSubsets:
         if self.subsets is not None:
             whole("subsets", self.subsets)
         if self.update not in UPDATES:
-            raise ValueError(f"update: found {self.update!r}, expected one of {UPDATES}")
+            raise InputError(f"update: found {self.update!r}, expected one of {UPDATES}")
         if isinstance(self.initial, str) and self.initial not in INITIAL:
-            raise ValueError(
+            raise InputError(
                 f"initial: found {self.initial!r}, expected one of {INITIAL} or a volume"
             )
         if not 0 < self.i0 < np.inf:
-            raise ValueError(f"i0: found {self.i0:g}, expected photons, more than 0")
+            raise InputError(f"i0: found {self.i0:g}, expected photons, more than 0")
         if not 0 <= self.background < np.inf:
-            raise ValueError(f"background: found {self.background:g}, expected photons, 0 or more")
+            raise InputError(f"background: found {self.background:g}, expected photons, 0 or more")
 
     def statistics(self, stream: Stream, used: NDArray[np.bool_], level: int) -> RayStatistics:
         """Photon statistics of radiographs binned by `level`, whose `used` pixels count."""
@@ -191,7 +192,7 @@ def start_volume(
 
     Raises
     ------
-    ValueError
+    InputError
         If a given volume is not of the grid's shape.
     """
     ordered_subsets(geometry, grid, options.subsets)  # refuses a wrong number before the long work

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.methods.alignment.align import align as align_scan
 from clra.methods.alignment.rejected_views import all_but
 from clra.methods.correction import corrected
@@ -86,7 +87,7 @@ def reconstruct(
 
     Raises
     ------
-    ValueError
+    InputError
         If the method or an option of it is unknown, no view is believed, both `motion` and `align`
         are given, or the scan is one that Katsevich's method cannot treat; says what pitch, panel
         or field of view would do.
@@ -137,13 +138,13 @@ def reconstruct_into(
 
     Raises
     ------
-    ValueError
+    InputError
         As :func:`reconstruct` does.
     """
     if method not in METHODS:
-        raise ValueError(f"method: found {method!r}, expected one of {METHODS}")
+        raise InputError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
-        raise ValueError("motion and align: found both, expected one of them")
+        raise InputError("motion and align: found both, expected one of them")
     if believed is not None:
         believed = believed_views(believed, scan.views)
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work

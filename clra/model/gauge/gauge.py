@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.gauge.modes import GAUGE_MODES, gauge_columns, mode_field
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -135,11 +136,11 @@ class Gauge:
 
         Raises
         ------
-        ValueError
+        InputError
             If the motion is of another number of views.
         """
         if motion.views != self.views:
-            raise ValueError(f"motion: found {motion.views} views, expected {self.views}")
+            raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         design, weight = self._design, self._weight
         table = _table(motion)
         target = _rows(table.T, weight)
@@ -203,11 +204,11 @@ class Gauge:
 
         Raises
         ------
-        ValueError
+        InputError
             If they are not.
         """
         if estimate.views != truth.views:
-            raise ValueError(f"estimate: found {estimate.views} views, expected {truth.views}")
+            raise InputError(f"estimate: found {estimate.views} views, expected {truth.views}")
         difference = Motion(
             shift_u=estimate.shift_u - truth.shift_u,
             shift_v=estimate.shift_v - truth.shift_v,
@@ -317,11 +318,11 @@ def without_gauge(
 
     Raises
     ------
-    ValueError
+    InputError
         If the motion is of another number of views.
     """
     if motion.views != geometry.views:
-        raise ValueError(f"motion: found {motion.views} views, expected {geometry.views}")
+        raise InputError(f"motion: found {motion.views} views, expected {geometry.views}")
     modes, weight = _modes(False), _weight(geometry, False)
     columns = np.concatenate([gauge_columns(geometry, points, modes) for points in clouds], axis=1)
     design = _rows(columns.reshape(3, motion.views, -1), weight)

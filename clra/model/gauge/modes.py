@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.validation import vectors
 
@@ -71,7 +72,7 @@ def gauge_columns(
 def mode_field(mode: str, points: Floats) -> Floats:
     """Return the movement of each point for a unit of a mode, (n, 3) [mm]."""
     if mode not in GAUGE_MODES:
-        raise ValueError(f"modes: found {mode!r}, expected some of {GAUGE_MODES}")
+        raise InputError(f"modes: found {mode!r}, expected some of {GAUGE_MODES}")
     kind, _, axis = mode.partition(" ")
     if kind == "scale":
         return points

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.helix.helix import Helix
 
@@ -34,7 +35,7 @@ def fit_helices(geometry: ConeBeamGeometry) -> list[tuple[slice, Helix]]:
 
     Raises
     ------
-    ValueError
+    InputError
         If the views are not those of helices about z with an upright panel that faces the axis,
         to a tenth of a pixel.
     """
@@ -46,11 +47,11 @@ def fit_helices(geometry: ConeBeamGeometry) -> list[tuple[slice, Helix]]:
     voxel = np.linalg.norm(geometry.v, axis=1) * geometry.source_to_axis
     voxel /= geometry.source_to_detector
     if not usual[0] > 0 or geometry.views * usual[1] < float(np.median(voxel)):
-        raise ValueError(
+        raise InputError(
             "trajectory: found no rise along the rotation axis, expected a helix; use method 'fbp'"
         )
     if usual[0] > LARGEST_STEP * (1 + 1e-9):  # 60 views a turn, rounded, will do
-        raise ValueError(
+        raise InputError(
             f"trajectory: found {math.degrees(usual[0]):.4g} degrees from view to view, expected "
             f"a helix of at most {math.degrees(LARGEST_STEP):g}; use method 'fbp'"
         )
@@ -73,7 +74,7 @@ def fit_helices(geometry: ConeBeamGeometry) -> list[tuple[slice, Helix]]:
 def _fit(geometry: ConeBeamGeometry, first: int) -> Helix:
     """Fit one helix to views, of which the first has the number `first` in its scan."""
     if geometry.views < 3:
-        raise ValueError(
+        raise InputError(
             f"trajectory: view {first} continues no helix, expected equal steps in angle and "
             "height; use method 'fbp'"
         )
@@ -97,13 +98,13 @@ def _fit(geometry: ConeBeamGeometry, first: int) -> Helix:
         shape=geometry.shape,
     )
     if helix.pitch_u == 0 or helix.pitch_v == 0:
-        raise ValueError(
+        raise InputError(
             "trajectory: found a panel turned on its side, expected columns parallel to z"
         )
     apart = _distance(geometry, helix)
     worst = int(apart.argmax())
     if not apart[worst] <= TOLERANCE:
-        raise ValueError(
+        raise InputError(
             f"trajectory: view {first + worst} is {apart[worst]:.3g} pixels off the best helix, "
             f"expected at most {TOLERANCE}: a panel that faces the axis and equal steps in angle "
             "and height; use method 'fbp'"

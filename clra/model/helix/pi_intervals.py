@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.grid import VolumeGrid
 from clra.model.helix.helix import Helix
 
@@ -41,7 +42,7 @@ def field_of_view(helices: Sequence[Helix], grid: VolumeGrid) -> float:
 
     Raises
     ------
-    ValueError
+    InputError
         If a panel does not see the axis, is shorter than the Tam-Danielsson window, or has too few
         rows in it; says what rows, pitch or field of view would do.
     """
@@ -51,13 +52,13 @@ def field_of_view(helices: Sequence[Helix], grid: VolumeGrid) -> float:
 def _field_of_view(helix: Helix, grid: VolumeGrid) -> float:
     seen = helix.field_radius
     if not seen > 0:
-        raise ValueError(
+        raise InputError(
             "panel: it does not see the rotation axis, expected a field of view about the axis"
         )
     borders = helix.row(np.stack(helix.window(0.0)))
     window = float(np.ptp(borders))
     if window < _LEAST_ROWS:
-        raise ValueError(
+        raise InputError(
             f"trajectory: a pitch of {helix.pitch:.4g} mm makes a Tam-Danielsson window of "
             f"{window:.2g} rows, expected a pitch of at least "
             f"{helix.pitch * _LEAST_ROWS / window:.4g} mm; or use method 'fbp'"
@@ -79,7 +80,7 @@ def _field_of_view(helix: Helix, grid: VolumeGrid) -> float:
         advice.append(
             f"a field of view of at most {2 * possible[-1]:.4g} mm (found {2 * radius:.4g})"
         )
-    raise ValueError(
+    raise InputError(
         f"panel: rows 0 to {helix.shape[0] - 1} are less than the Tam-Danielsson window, expected "
         f"{' or '.join(advice)}; or use method 'fbp'"
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.validation import column, positive, vectors, whole
@@ -30,7 +31,7 @@ class Ellipsoids:
 
     Raises
     ------
-    ValueError
+    InputError
         If lengths disagree, a number is not finite or a semi-axis is not positive.
     """
 
@@ -48,9 +49,9 @@ class Ellipsoids:
         for name in ("semi_axes", "attenuation"):
             found = len(getattr(self, name))
             if found != len(self):
-                raise ValueError(f"{name}: found {found} ellipsoids, expected {len(self)}")
+                raise InputError(f"{name}: found {found} ellipsoids, expected {len(self)}")
         if self.semi_axes.min() <= 0:
-            raise ValueError(f"semi_axes: found {self.semi_axes.min()}, expected positive lengths")
+            raise InputError(f"semi_axes: found {self.semi_axes.min()}, expected positive lengths")
 
     def __len__(self) -> int:
         """Return the number of ellipsoids."""
@@ -103,7 +104,7 @@ class Ellipsoids:
 
         Raises
         ------
-        ValueError
+        InputError
             If an ellipsoid reaches the plane through a source parallel to its panel.
         """
         oversample = whole("oversample", oversample)
@@ -142,7 +143,7 @@ class Ellipsoids:
         depth_axes = to_pixels[2] * self.semi_axes
         clear = shadow[:, 2] ** 2 - np.sum(depth_axes**2, axis=1)
         if (shadow[:, 2] <= 0).any() or (clear <= 0).any():
-            raise ValueError("an ellipsoid reaches the plane of a source: move it or the source")
+            raise InputError("an ellipsoid reaches the plane of a source: move it or the source")
         boxes = np.empty((len(self), 2, 2), dtype=np.int_)
         for k, size in enumerate(shape[::-1]):
             axes = (to_pixels[k] - shadow[:, k, None] * to_pixels[2]) * self.semi_axes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.motion import Motion
 from clra.model.validation import whole
 
@@ -77,9 +78,9 @@ def _motion(
     """Map numbers within 0 and 1 to the ranges."""
     low, high = shift
     if not low <= high:
-        raise ValueError(f"shift: found {shift}, expected (lowest, highest) in pixels")
+        raise InputError(f"shift: found {shift}, expected (lowest, highest) in pixels")
     if not 0 <= magnification < 1:
-        raise ValueError(f"magnification: found {magnification}, expected within 0 and 1")
+        raise InputError(f"magnification: found {magnification}, expected within 0 and 1")
     return Motion(
         shift_u=low + (high - low) * u,
         shift_v=low + (high - low) * v,

@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.ops.filtering.fft_device import DeviceFFT, NoPlanError
 from clra.ops.filtering.fft_host import HostFFT
 from clra.ops.runtime import build
@@ -74,7 +75,7 @@ class RealFFT:
 
     Raises
     ------
-    ValueError
+    InputError
         If shape, axes or backend are none of these.
     """
 
@@ -88,9 +89,9 @@ class RealFFT:
         allocator: Allocator | None = None,
     ) -> None:
         if len(shape) != 3 or min(shape) < 1:
-            raise ValueError(f"shape: found {shape}, expected three positive numbers")
+            raise InputError(f"shape: found {shape}, expected three positive numbers")
         if tuple(axes) not in ((2,), (1, 2)):
-            raise ValueError(f"axes: found {tuple(axes)}, expected (2,) or (1, 2)")
+            raise InputError(f"axes: found {tuple(axes)}, expected (2,) or (1, 2)")
         self.shape = shape
         self.spectrum_shape = (*shape[:2], shape[2] // 2 + 1)
         self._context = context
@@ -134,7 +135,7 @@ class RealFFT:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)
@@ -190,7 +191,7 @@ class RealFFT:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)
@@ -217,7 +218,7 @@ def _backend(context: cl.Context, backend: str | None) -> str:
     if backend is None:
         return "scipy" if build.is_cpu(build.device_of(context)) else "reikna"
     if backend not in BACKENDS:
-        raise ValueError(f"backend: found {backend!r}, expected one of {', '.join(BACKENDS)}")
+        raise InputError(f"backend: found {backend!r}, expected one of {', '.join(BACKENDS)}")
     return backend
 
 

@@ -144,7 +144,7 @@ class KatsevichFilter:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an argument is none of the above.
         """
         build.check_queue(queue, self._context)

@@ -8,6 +8,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, NDArray
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.ops.filtering.fft import RealFFT, fast_length
 from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
@@ -55,11 +56,11 @@ def taper(rows: int, fraction: float) -> NDArray[np.float32]:
 
     Raises
     ------
-    ValueError
+    InputError
         If the fraction is out of range.
     """
     if not 0 <= fraction <= 0.5:
-        raise ValueError(f"fraction: found {fraction}, expected 0 to 0.5")
+        raise InputError(f"fraction: found {fraction}, expected 0 to 0.5")
     row = np.arange(rows)
     depth = np.minimum(row, rows - 1 - row) + 0.5
     roll = np.minimum(1.0, depth / max(fraction * rows, 0.5))
@@ -111,7 +112,7 @@ class RampFilter:
 
     Raises
     ------
-    ValueError
+    InputError
         If an argument is none of the above.
 
     References
@@ -134,7 +135,7 @@ class RampFilter:
         scratch_limit: int | None = None,
     ) -> None:
         if window not in WINDOWS:
-            raise ValueError(f"window: found {window!r}, expected one of {', '.join(WINDOWS)}")
+            raise InputError(f"window: found {window!r}, expected one of {', '.join(WINDOWS)}")
         self.window = window
         self._context = context
         self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
@@ -163,7 +164,7 @@ class RampFilter:
 
         Raises
         ------
-        ValueError
+        InputError
             If views or shape differ.
         """
         check_geometry(geometry, (self._views, self._rows, self._columns))
@@ -199,7 +200,7 @@ class RampFilter:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an argument is none of the above.
         """
         build.check_queue(queue, self._context)
@@ -248,7 +249,7 @@ def _row_weights(row_weight: ArrayLike | None, rows: int) -> NDArray[np.float32]
         return np.ones(rows, np.float32)
     weights = np.ascontiguousarray(row_weight, np.float32)
     if weights.shape != (rows,) or not np.all(np.isfinite(weights)):
-        raise ValueError(f"row_weight: found shape {weights.shape}, expected {rows} finite numbers")
+        raise InputError(f"row_weight: found shape {weights.shape}, expected {rows} finite numbers")
     return weights
 
 

@@ -8,6 +8,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.ops.images.bandpass_tables import plane_fit, reciprocal, spline_table
 from clra.ops.images.blur import gaussian_taps
 from clra.ops.runtime import build
@@ -67,7 +68,7 @@ class Bandpass:
 
     Raises
     ------
-    ValueError
+    InputError
         If sigmas or mask are none of the above, or the image is too small for `low_pass`.
     """
 
@@ -85,18 +86,18 @@ class Bandpass:
         rows, columns = self.shape = shape
         self.low_pass, self.high_pass = low_pass, min(high_pass, min(shape) / 4)
         if not LEAST_LOW_PASS <= low_pass <= LARGEST_LOW_PASS:
-            raise ValueError(
+            raise InputError(
                 f"low_pass: found {low_pass}, expected {LEAST_LOW_PASS} to {LARGEST_LOW_PASS} px"
             )
         if not self.high_pass >= 2 * low_pass:
-            raise ValueError(
+            raise InputError(
                 f"high_pass: found {self.high_pass} px (of {high_pass}, for images {shape}), "
                 f"expected at least twice low_pass, {2 * low_pass}"
             )
         if mask is not None and np.shape(mask) != shape:
-            raise ValueError(f"mask: found shape {np.shape(mask)}, expected {shape}")
+            raise InputError(f"mask: found shape {np.shape(mask)}, expected {shape}")
         if mask is not None and not np.any(mask):
-            raise ValueError("mask: found no pixel that counts, expected some")
+            raise InputError("mask: found no pixel that counts, expected some")
         self.stride = line_stride(columns)
         self._context, self._views = context, views
         self._masked = mask is not None
@@ -180,13 +181,13 @@ class Bandpass:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)
         n = build.check_images("images", images, self.shape, self._context)
         if n > self._views:
-            raise ValueError(f"images: found {n} of them, expected 1 to {self._views}")
+            raise InputError(f"images: found {n} of them, expected 1 to {self._views}")
         build.check_array("out", out, (n, *self.shape), context=self._context)
         if self._own is None:
             self._own = self.empty(), self.empty_expanded()

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import pyopencl as cl
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.ops.runtime import build
 from clra.ops.runtime.kernel import Step
 from clra.ops.runtime.lines import lanes
@@ -73,7 +74,7 @@ class Restrict2D(_Resampling):
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         n, rows, columns = _shape("fine", fine, (1, 2, 2))
@@ -151,5 +152,5 @@ def _shape(name: str, array: Array, least: tuple[int, int, int]) -> tuple[int, i
         raise TypeError(f"{name}: found {type(array).__name__}, expected a pyopencl.array.Array")
     shape = array.shape
     if len(shape) != 3 or any(n < m for n, m in zip(shape, least, strict=True)):
-        raise ValueError(f"{name}: found shape {shape}, expected three axes of at least {least}")
+        raise InputError(f"{name}: found shape {shape}, expected three axes of at least {least}")
     return shape[0], shape[1], shape[2]

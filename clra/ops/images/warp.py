@@ -7,6 +7,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.ops.runtime import build
 from clra.ops.runtime.buffers import Allocator, Scratch, within
 from clra.ops.runtime.kernel import Step, to_device
@@ -48,7 +49,7 @@ class Warp:
 
     Raises
     ------
-    ValueError
+    InputError
         If the shape is not two positive numbers.
 
     References
@@ -66,7 +67,7 @@ class Warp:
         scratch_limit: int | None = None,
     ) -> None:
         if len(shape) != 2 or min(shape) < 1:
-            raise ValueError(f"shape: found {shape}, expected two positive numbers")
+            raise InputError(f"shape: found {shape}, expected two positive numbers")
         self.shape = shape
         self._context = context
         cpu = build.is_cpu(build.device_of(context))
@@ -121,7 +122,7 @@ class Warp:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)

@@ -8,6 +8,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops.filtering.ramp import FADE
@@ -63,7 +64,7 @@ class Coverage:
 
     Raises
     ------
-    ValueError
+    InputError
         If there is not a weight for each row and view.
     """
 
@@ -80,7 +81,7 @@ class Coverage:
     ) -> None:
         weights = np.asarray(row_weight, np.float64)
         if weights.shape != (geometry.rows,):
-            raise ValueError(f"row_weight: found {weights.shape}, expected ({geometry.rows},)")
+            raise InputError(f"row_weight: found {weights.shape}, expected ({geometry.rows},)")
         self._view_weight = view_weights(view_weight, geometry.views)
         self._context = context
         self._grid = grid
@@ -112,7 +113,7 @@ class Coverage:
 
         Raises
         ------
-        ValueError
+        InputError
             If views or panel differ.
         """
         check_geometry(geometry, self._counted)
@@ -200,7 +201,7 @@ class Coverage:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If the volume is not of this grid.
         """
         build.check_queue(queue, self._context)

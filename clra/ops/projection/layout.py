@@ -11,6 +11,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.projection.transpose import Planes, Transpose
@@ -238,11 +239,11 @@ def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
 
     Raises
     ------
-    ValueError
+    InputError
         If it is neither "zyx" nor "yxz".
     """
     if order not in ("zyx", "yxz"):
-        raise ValueError(f"volume_order: found {order!r}, expected 'zyx' or 'yxz'")
+        raise InputError(f"volume_order: found {order!r}, expected 'zyx' or 'yxz'")
     nz, ny, nx = grid.shape
     return (nz, ny, nx) if order == "zyx" else (ny, nx, nz)
 
@@ -275,7 +276,7 @@ def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float
 
     Raises
     ------
-    ValueError
+    InputError
         If a voxel, or the one beyond the last, is not in front of a source.
     """
     index_to_world = grid.index_to_world()
@@ -284,7 +285,7 @@ def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float
     corners = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(8, 3)
     depth = (matrices[:, 2, :3] @ corners.T + matrices[:, 2, 3:]).min(axis=1)
     if not depth.min() > 0:
-        raise ValueError(
+        raise InputError(
             f"grid: it reaches behind the source of view {int(depth.argmin())}, expected every "
             "voxel and the one beyond in front of every source"
         )

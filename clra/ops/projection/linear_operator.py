@@ -42,7 +42,7 @@ def as_linear_operator(
 
     Raises
     ------
-    ValueError
+    InputError
         If the grid reaches behind a source.
 
     Examples

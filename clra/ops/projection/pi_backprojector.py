@@ -56,7 +56,7 @@ class PiBackProjector:
 
     Raises
     ------
-    ValueError
+    InputError
         If the grid reaches behind a source.
     """
 
@@ -126,7 +126,7 @@ class PiBackProjector:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an argument is none of the above.
         """
         layout = self._layout

@@ -60,7 +60,7 @@ class ForwardProjector:
 
     Raises
     ------
-    ValueError
+    InputError
         If the grid reaches behind a source, or for another `volume_order`.
 
     References
@@ -99,7 +99,7 @@ class ForwardProjector:
 
         Raises
         ------
-        ValueError
+        InputError
             If views or panel differ, or the grid reaches behind a source.
         """
         self._layout.set_geometry(geometry)
@@ -137,7 +137,7 @@ class ForwardProjector:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an argument is none of the above.
         """
         layout = self._layout
@@ -201,7 +201,7 @@ class BackProjector:
 
     Raises
     ------
-    ValueError
+    InputError
         If the grid reaches behind a source, or for another `volume_order`.
     """
 
@@ -240,7 +240,7 @@ class BackProjector:
 
         Raises
         ------
-        ValueError
+        InputError
             If views or panel differ, or the grid reaches behind a source.
         """
         self._layout.set_geometry(geometry)
@@ -279,7 +279,7 @@ class BackProjector:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an argument is none of the above.
         """
         layout = self._layout

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 
 
@@ -18,12 +19,12 @@ def check_geometry(geometry: ConeBeamGeometry, expected: tuple[int, int, int]) -
 
     Raises
     ------
-    ValueError
+    InputError
         If they differ.
     """
     found = (geometry.views, geometry.rows, geometry.columns)
     if found != expected:
-        raise ValueError(f"geometry: found {found}, expected {expected} as (views, rows, columns)")
+        raise InputError(f"geometry: found {found}, expected {expected} as (views, rows, columns)")
 
 
 def successive(views: slice | None, total: int) -> tuple[int, int]:
@@ -38,12 +39,12 @@ def successive(views: slice | None, total: int) -> tuple[int, int]:
 
     Raises
     ------
-    ValueError
+    InputError
         If these are not one or more successive views.
     """
     start, stop, step = (slice(None) if views is None else views).indices(total)
     if step != 1 or stop <= start:
-        raise ValueError(f"views: found {views}, expected successive ones of {total}")
+        raise InputError(f"views: found {views}, expected successive ones of {total}")
     return start, stop
 
 
@@ -51,5 +52,5 @@ def view_weights(view_weight: ArrayLike | None, views: int) -> NDArray[np.float6
     """Return weights of views as given, (views,); 1 by default."""
     weights = np.ones(views) if view_weight is None else np.asarray(view_weight, np.float64)
     if weights.shape != (views,) or not np.all(np.isfinite(weights)):
-        raise ValueError(f"view_weight: found {weights.shape}, expected {views} finite numbers")
+        raise InputError(f"view_weight: found {weights.shape}, expected {views} finite numbers")
     return weights

@@ -8,6 +8,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, NDArray
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.ops.images.bandpass import Bandpass
 from clra.ops.images.blur import Blur
 from clra.ops.registration.phase_correlation import CoarseShift, check_pair
@@ -121,7 +122,7 @@ class Registration:
 
     Raises
     ------
-    ValueError
+    InputError
         If an option is none of the above.
 
     Notes
@@ -154,14 +155,14 @@ class Registration:
     ) -> None:
         rows, columns = self.shape = shape
         if min(shape) < SMALLEST:
-            raise ValueError(f"shape: found {shape}, expected at least {SMALLEST} rows and columns")
+            raise InputError(f"shape: found {shape}, expected at least {SMALLEST} rows and columns")
         if iterations < 1:
-            raise ValueError(f"iterations: found {iterations}, expected 1 or more")
+            raise InputError(f"iterations: found {iterations}, expected 1 or more")
         if not max_shift > 0:
-            raise ValueError(f"max_shift: found {max_shift}, expected a positive number of pixels")
+            raise InputError(f"max_shift: found {max_shift}, expected a positive number of pixels")
         cpu = build.is_cpu(build.device_of(context))
         if views is not None and views < 1:
-            raise ValueError(f"views: found {views}, expected 1 or more")
+            raise InputError(f"views: found {views}, expected 1 or more")
         most = within(_SCRATCH_CPU if cpu else _SCRATCH_GPU, scratch_limit)
         fitting = max(1, most // pair_bytes(shape, high_pass))
         views = fitting if views is None else min(views, fitting)
@@ -169,7 +170,7 @@ class Registration:
         self._iterations, self._magnification = iterations, int(magnification)
         self._max_shift = float(max_shift)
         if not spread >= 0:
-            raise ValueError(f"spread: found {spread}, expected 0 or more")
+            raise InputError(f"spread: found {spread}, expected 0 or more")
         self._spread = float(spread)
         memory = self._memory = Scratch(context, allocator)
         band = self._bandpass = Bandpass(
@@ -250,7 +251,7 @@ class Registration:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)

@@ -287,7 +287,7 @@ class PhaseCorrelation:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)

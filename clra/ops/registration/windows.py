@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clra.errors import InputError
+
 Floats = NDArray[np.float64]
 
 
@@ -35,11 +37,11 @@ def registration_window(
 
     Raises
     ------
-    ValueError
+    InputError
         If `margin` is out of range, or nothing of the mask is left within it.
     """
     if not 0.02 <= margin <= 0.3:
-        raise ValueError(f"margin: found {margin}, expected 0.02 to 0.3")
+        raise InputError(f"margin: found {margin}, expected 0.02 to 0.3")
     sides = []
     for length in shape:
         position = (np.arange(length) + 0.5) / length
@@ -56,7 +58,7 @@ def registration_window(
         if not counts.all():
             weights *= _rise((distance_transform_edt(counts) - 1) / (3 * low_pass))
     if not weights.any():
-        raise ValueError(f"mask: found no pixel that counts within the margin {margin}")
+        raise InputError(f"mask: found no pixel that counts within the margin {margin}")
     return np.asarray(weights)
 
 

@@ -10,13 +10,10 @@ import pyopencl as cl
 import pyopencl.array
 
 from clra import kernels
+from clra.errors import InputError, KernelBuildError
 from clra.ops.runtime import pocl
 
 BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable", "-cl-denorms-are-zero")
-
-
-class KernelBuildError(RuntimeError):
-    """A kernel did not compile; the message carries the compiler's log."""
 
 
 def device_of(owner: cl.Context | cl.CommandQueue) -> cl.Device:
@@ -133,19 +130,19 @@ def check_array(
     ------
     TypeError
         If it is no device array.
-    ValueError
+    InputError
         If type, shape, memory order or context differ.
     """
     if not isinstance(array, cl.array.Array):
         raise TypeError(f"{name}: found {type(array).__name__}, expected a pyopencl.array.Array")
     if array.dtype != np.dtype(dtype):
-        raise ValueError(f"{name}: found {array.dtype}, expected {np.dtype(dtype)}")
+        raise InputError(f"{name}: found {array.dtype}, expected {np.dtype(dtype)}")
     if array.shape != tuple(shape):
-        raise ValueError(f"{name}: found shape {array.shape}, expected {tuple(shape)}")
+        raise InputError(f"{name}: found shape {array.shape}, expected {tuple(shape)}")
     if not array.flags.c_contiguous:
-        raise ValueError(f"{name}: found strides {array.strides}, expected C order")
+        raise InputError(f"{name}: found strides {array.strides}, expected C order")
     if context is not None and array.context != context:
-        raise ValueError(f"{name}: its context {array.context} is not the operator's {context}")
+        raise InputError(f"{name}: its context {array.context} is not the operator's {context}")
 
 
 def check_images(
@@ -168,13 +165,13 @@ def check_images(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, InputError
         As :func:`check_array` does, and for fewer images.
     """
     check_array(name, array, getattr(array, "shape", ()), context=context)
     if array.shape[1:] != tuple(shape) or array.ndim == 0 or len(array) < least:
         expected = ", ".join(["n", *map(str, shape)])
-        raise ValueError(
+        raise InputError(
             f"{name}: found shape {array.shape}, expected ({expected}) with n at least {least}"
         )
     return len(array)
@@ -183,7 +180,7 @@ def check_images(
 def check_queue(queue: cl.CommandQueue, context: cl.Context) -> None:
     """Refuse a queue of another context than an operator's, with a ValueError."""
     if queue.context != context:
-        raise ValueError(f"queue: its context {queue.context} is not the operator's {context}")
+        raise InputError(f"queue: its context {queue.context} is not the operator's {context}")
 
 
 def buffer_argument(array: cl.array.Array) -> tuple[Any, np.uint64]:

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import pyopencl as cl
 
-
-class NoDeviceError(RuntimeError):
-    """No OpenCL device, or none of the name asked for; the message says what there is."""
+from clra.errors import DeviceError
 
 
 @dataclass(frozen=True)
@@ -102,14 +100,14 @@ def choose_device(device: str | cl.Device | None = None) -> cl.Device:
 
     Raises
     ------
-    NoDeviceError
+    DeviceError
         If there is no device or none that matches; says what was found and how to get PoCL.
     """
     if isinstance(device, cl.Device):
         return device
     found = _all_devices()
     if not found:
-        raise NoDeviceError(
+        raise DeviceError(
             "no OpenCL device: install a GPU driver with OpenCL, or PoCL for the CPU "
             "(pip install 'clra[pocl]', or apt-get install pocl-opencl-icd)"
         )
@@ -124,7 +122,7 @@ def choose_device(device: str | cl.Device | None = None) -> cl.Device:
             if text in f"{candidate.name} {platform.name} {platform.version}".lower():
                 return candidate
         listing = ", ".join(f"{i} {d.name.strip()} ({d.platform.version})" for i, d in found)
-        raise NoDeviceError(f"no OpenCL device {wanted!r}; found {listing}")
+        raise DeviceError(f"no OpenCL device {wanted!r}; found {listing}")
     rank = {"GPU": 2, "other": 1, "CPU": 0}
     return max(
         (candidate for _, candidate in found),
@@ -147,7 +145,7 @@ def choose_devices(device: str | cl.Device | None = None) -> list[cl.Device]:
 
     Raises
     ------
-    NoDeviceError
+    DeviceError
         As :func:`choose_device` does.
     """
     if device != "all":

@@ -11,6 +11,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.ops.runtime import build
 from clra.ops.runtime.kernel import Step, to_device
 
@@ -31,7 +32,7 @@ class RayStatistics:
 
     Raises
     ------
-    ValueError
+    InputError
         If photons are negative or not finite.
 
     References
@@ -43,12 +44,12 @@ class RayStatistics:
     def __init__(self, context: cl.Context, open_beam: ArrayLike, background: float = 0.0) -> None:
         photons = np.asarray(open_beam, np.float64)
         if photons.ndim != 2 or not (np.isfinite(photons).all() and photons.min() >= 0):
-            raise ValueError(
+            raise InputError(
                 f"open_beam: found shape {photons.shape} from {photons.min():g}, expected photons "
                 "of rows and columns, none negative"
             )
         if not 0 <= background < np.inf:
-            raise ValueError(f"background: found {background:g}, expected photons, 0 or more")
+            raise InputError(f"background: found {background:g}, expected photons, 0 or more")
         self._context = context
         self._shape = photons.shape
         self._open_beam = to_device(context, photons)
@@ -84,7 +85,7 @@ class RayStatistics:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         n = self._check(queue, simulated=simulated, measured=measured)
@@ -257,7 +258,7 @@ class VolumeStep:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         sizes = self._check(queue, volume, numerator, denominator)

@@ -8,12 +8,13 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clra.errors import DeviceError, InputError
 from clra.ops.runtime import build
 
 Floats = NDArray[np.float32]
 
 
-class DeviceMemoryError(RuntimeError):
+class DeviceMemoryError(DeviceError):
     """Work that does not fit on the device; the message says what would."""
 
 
@@ -76,7 +77,7 @@ class Budgets:
         """Share out what may be used; by default 3/4 of the device and half of the free host."""
         for name, value in (("max_device_memory", most_device), ("max_host_memory", most_host)):
             if value is not None and value <= 0:
-                raise ValueError(f"{name}: found {value}, expected a positive number of bytes")
+                raise InputError(f"{name}: found {value}, expected a positive number of bytes")
         host = most_host or host_memory() // 2
         budget = most_device or device.global_mem_size * 3 // 4
         shared = build.is_cpu(device)

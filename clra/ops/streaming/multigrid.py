@@ -216,7 +216,7 @@ class Residual:
 
         Raises
         ------
-        TypeError, ValueError
+        TypeError, InputError
             If an array is none of the above.
         """
         build.check_queue(queue, self._context)

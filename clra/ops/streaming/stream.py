@@ -65,9 +65,9 @@ class Stream:
 
     Raises
     ------
-    NoDeviceError
+    DeviceError
         If there is no such device.
-    ValueError
+    InputError
         If a budget is not positive.
     """
 

@@ -6,6 +6,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.view_selection import runs, views_that_see
@@ -55,11 +56,11 @@ def volume_from(stream: Stream, grid: VolumeGrid, values: Any, *, volumes: int =
 
     Raises
     ------
-    ValueError
+    InputError
         If the shapes differ.
     """
     if tuple(values.shape) != grid.shape:
-        raise ValueError(f"volume: found shape {tuple(values.shape)}, expected {grid.shape}")
+        raise InputError(f"volume: found shape {tuple(values.shape)}, expected {grid.shape}")
     volume = Volume(stream, grid, volumes=volumes)
     for index, planes in enumerate(volume.planes):
         host = np.moveaxis(np.asarray(values[planes], np.float32), 0, 2)

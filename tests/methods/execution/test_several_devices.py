@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import clra
+from clra.errors import DeviceError
 from clra.methods.execution.several_devices import on_devices
-from clra.ops.runtime.devices import NoDeviceError, choose_device
+from clra.ops.runtime.devices import choose_device
 
 TWICE = """
 import sys
@@ -89,5 +90,5 @@ def test_alignment_takes_one_device():
     geometry = clra.circular(
         4, source_to_axis=50.0, source_to_detector=100.0, pixel_size=1.0, shape=(64, 64)
     )
-    with pytest.raises(NoDeviceError, match="no OpenCL device 'all'"):
+    with pytest.raises(DeviceError, match="no OpenCL device 'all'"):
         clra.align(clra.Scan(np.zeros((4, 64, 64), np.float32), geometry), device="all")

@@ -10,6 +10,7 @@ import pyopencl.array
 import pytest
 
 from clra import kernels
+from clra.errors import KernelBuildError
 from clra.ops.images.pyramid import Restrict2D
 from clra.ops.runtime import build
 
@@ -52,7 +53,7 @@ def test_threads_compile_once(context, monkeypatch):
 
 def test_a_kernel_that_does_not_compile_raises_with_the_log(context, monkeypatch):
     monkeypatch.setattr(kernels, "source", lambda name: "__kernel void f( { nonsense }")
-    with pytest.raises(build.KernelBuildError, match=r"(?s)broken\.cl.*error"):
+    with pytest.raises(KernelBuildError, match=r"(?s)broken\.cl.*error"):
         build.builds(context).program("broken.cl")
 
 
