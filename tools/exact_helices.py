@@ -19,7 +19,8 @@ from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.katsevich import katsevich
 from clra.model.grid import VolumeGrid
 from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 SOURCE_TO_AXIS, SOURCE_TO_DETECTOR, FIELD, COLUMNS = 3.0, 6.0, 1.05, 160  # mm; FIELD is a radius
 PHANTOMS = {

@@ -29,8 +29,9 @@ from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.phantoms.perturbation import random_motion, smooth_motion
-from clra.ops.streaming.stream import Radiographs, Stream
-from clra.ops.streaming.volume_slabs import SlabProjector, constant_volume, volume_from
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import SlabProjector, constant_volume, volume_from
+from clra.ops.streaming.stream import Stream
 
 PIXEL, COLUMNS, VIEWS, PLANES = 0.139, 2304, 4858, 5428  # the paper's
 PHOTONS = 1e4

@@ -25,7 +25,9 @@ from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import porous
 from clra.model.phantoms.perturbation import smooth_motion
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 PANEL, SOURCE, DETECTOR = 422.56, 2.8823, 315.5  # mm
 PAPER_PIXEL = 139.0  # um

@@ -19,7 +19,7 @@ from clra.app import progress_bar
 
 if TYPE_CHECKING:
     from clra.model.scan import Scan
-    from clra.ops.streaming.stream import Report
+    from clra.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Console:
         False
     )
 
-    def progress(self) -> AbstractContextManager["Report"]:
+    def progress(self) -> AbstractContextManager["ProgressCallback"]:
         """Show progress on stderr while a block runs, unless quiet."""
         return progress_bar.shown(self.quiet)
 

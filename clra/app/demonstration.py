@@ -16,7 +16,7 @@ from clra.methods.reconstruction.reconstruct import reconstruct
 from clra.model.grid import default_grid
 
 if TYPE_CHECKING:
-    from clra.ops.streaming.stream import Report
+    from clra.progress import ProgressCallback
 
 # Chosen so that all of it ends within two minutes on two cores without a GPU.
 VIEWS, PANEL = 360, (256, 192)
@@ -65,7 +65,7 @@ def run_demo(
     phantom: str = "porous",
     seed: int = 0,
     device: Any = None,
-    progress: "Report | None" = None,
+    progress: "ProgressCallback | None" = None,
 ) -> Shown:
     """Simulate a space-filling scan, align it, reconstruct it before and after, report.
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
-    from clra.ops.streaming.stream import Progress, Report
+    from clra.progress import Progress, ProgressCallback
 
 # Seconds between lines where there is no terminal: a log of a night's run stays readable, and
 # nobody takes a silent run for a dead one.
@@ -66,7 +66,7 @@ class Lines:
 
 
 @contextmanager
-def shown(quiet: bool) -> Iterator["Report"]:
+def shown(quiet: bool) -> Iterator["ProgressCallback"]:
     """Show progress while the block runs.
 
     Parameters
@@ -77,7 +77,7 @@ def shown(quiet: bool) -> Iterator["Report"]:
     Yields
     ------
     callable
-        To be called with every :class:`~clra.ops.streaming.stream.Progress`.
+        To be called with every :class:`~clra.progress.Progress`.
     """
     if quiet:
         yield lambda progress: None
@@ -89,7 +89,7 @@ def shown(quiet: bool) -> Iterator["Report"]:
 
 
 @contextmanager
-def _bar() -> Iterator["Report"]:
+def _bar() -> Iterator["ProgressCallback"]:
     from rich import progress as bars
     from rich.console import Console
 

@@ -21,8 +21,8 @@ from clra.methods.reconstruction.imgr_state import Progressed, Step
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.model.schedule import level_factor
+from clra.ops.streaming.slab_projector import volume_from
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume_slabs import volume_from
 
 
 class Leftover:

@@ -14,7 +14,8 @@ from clra.model.grid import VolumeGrid, default_grid
 
 if TYPE_CHECKING:
     from clra.ops.streaming.memory import Budgets
-    from clra.ops.streaming.stream import Report, Stream
+    from clra.ops.streaming.stream import Stream
+    from clra.progress import ProgressCallback
 
 # Size of the test: views, and the most columns of a radiograph. It takes about a second on two
 # cores; with half of the columns launching counts and the estimate is a third too long.
@@ -92,7 +93,7 @@ def exact_updates(geometry: ConeBeamGeometry, grid: VolumeGrid) -> float:
 def measure(
     geometry: ConeBeamGeometry,
     device: Any = None,
-    report: "Report | None" = None,
+    report: "ProgressCallback | None" = None,
     *,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,

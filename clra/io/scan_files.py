@@ -13,8 +13,8 @@ from clra.errors import InputError
 from clra.io.nxtomo.fields import Overrides
 from clra.io.nxtomo.reader import read_nxtomo
 from clra.io.nxtomo.writer import write_nxtomo
-from clra.io.reporting import Report
 from clra.model.scan import Scan
+from clra.progress import ProgressCallback
 
 _FRAMES = (".tif", ".tiff", ".raw", ".bin")
 _VENDORS = (".txrm", ".xrm", ".vgi", ".xtekct", ".log")
@@ -81,7 +81,7 @@ def write_scan(
     scan: Scan,
     *,
     believed: NDArray[np.bool_] | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> None:
     """Write a scan's line integrals as NXtomo; the file appears whole or not at all.
 

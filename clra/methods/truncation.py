@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.rejected_views import odd, sums_of
-from clra.ops.streaming.stream import Radiographs
+from clra.ops.streaming.radiographs import Radiographs
 
 # Views that are looked at, and the part of the largest line integral, as means over rows, that may
 # be left at a border. Scatter and unevenness of the open beam leave one or two per cent; a sample

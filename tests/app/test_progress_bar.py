@@ -3,7 +3,7 @@ import io
 import pytest
 
 from clra.app.progress_bar import Lines, duration, shown
-from clra.ops.streaming.stream import Progress
+from clra.progress import Progress
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,9 @@ from clra.methods.memory_estimate import alignment_need, multigrid_need, reconst
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.imgr import imgr
 from clra.model.grid import default_grid
-from clra.ops.streaming.stream import HostPlanes, Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import HostPlanes
 
 MIB = 1 << 20
 AGREES = 0.2  # part by which prediction and measurement may differ

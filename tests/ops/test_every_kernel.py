@@ -18,8 +18,8 @@ from clra.ops.runtime.devices import choose_device
 from clra.ops.runtime.kernel import Step
 from clra.ops.statistics.poisson import RayStatistics
 from clra.ops.streaming.multigrid import add_update, cropped
+from clra.ops.streaming.slab_projector import volume_from
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume_slabs import volume_from
 
 # Where kernels may have no more than 32 work-items (Rusticl of Mesa 22) reikna gives up.
 pytestmark = pytest.mark.filterwarnings("ignore:.*transforms run on the host:UserWarning")

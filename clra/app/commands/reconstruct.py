@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from clra.model.grid import VolumeGrid
     from clra.model.motion import Motion
     from clra.model.scan import Scan
-    from clra.ops.streaming.stream import Report
+    from clra.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def _imgr(
     options: dict[str, Any],
     resume: bool,
     console: Console,
-    progress: "Report",
+    progress: "ProgressCallback",
     limits: dict[str, Any],
 ) -> "tuple[Step, ...]":
     """Reconstruct by multigrid iteration, keep what Ctrl-C leaves, or go on from there."""

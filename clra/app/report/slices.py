@@ -11,7 +11,8 @@ from clra.methods.reconstruction.missing_views import without_gaps
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 Image = NDArray[np.float32]
 

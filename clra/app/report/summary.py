@@ -19,7 +19,7 @@ from clra.model.scan import Scan
 if TYPE_CHECKING:
     from clra.app.report.comparison import Comparison
     from clra.methods.alignment.quality import Quality
-    from clra.ops.streaming.stream import Report
+    from clra.progress import ProgressCallback
 
 Floats = NDArray[np.float64]
 
@@ -114,7 +114,7 @@ def findings_of(
     *,
     volume: NDArray[np.float32] | None = None,
     device: Any = None,
-    progress: "Report | None" = None,
+    progress: "ProgressCallback | None" = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> Findings:

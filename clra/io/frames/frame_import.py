@@ -17,7 +17,7 @@ from clra.io.frames.stacks import FrameStack, RawLayout, Source, read_numbers, w
 from clra.io.nxtomo.clra_group import KINDS
 from clra.io.nxtomo.geometry_fields import Fields, far_source_distance
 from clra.io.nxtomo.writer import write_nxtomo
-from clra.io.reporting import Report
+from clra.progress import ProgressCallback
 
 # Angles that all lie within this [degree] are warned of: a whole turn is 6.28 rad.
 _NARROW = 7.0
@@ -65,7 +65,7 @@ def import_frames(
     centre_offset: float = 0.0,
     rotation: str = "ccw",
     name: str | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Imported:
     """Write raw frames as an NXtomo scan, frame by frame; it appears whole or not at all.
 

@@ -14,12 +14,12 @@ from clra.io.atomic import atomic_path
 from clra.io.nxtomo.clra_group import KIND_ATTRIBUTE, KINDS, write_additions
 from clra.io.nxtomo.geometry_fields import Fields, fields_of, top_down
 from clra.io.nxtomo.reader import DARK, FLAT, INVALID, PROJECTION
-from clra.io.reporting import Report, tell
 from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Projections
 from clra.model.validation import believed_views
+from clra.progress import ProgressCallback, tell
 
 Views = NDArray[np.intp]
 
@@ -47,7 +47,7 @@ def write_nxtomo(
     believed: NDArray[np.bool_] | None = None,
     fields: Fields | None = None,
     propagation_distance: float | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> None:
     """Write a scan as NXtomo; the file appears whole or not at all.
 
@@ -144,7 +144,7 @@ def write_nxtomo(
 
 
 def _copy(
-    writer: SlabWriter, parts: list[Projections], reverse: bool, progress: Report | None
+    writer: SlabWriter, parts: list[Projections], reverse: bool, progress: ProgressCallback | None
 ) -> None:
     """Write the frames of every part, one part after the other."""
     rows, columns = writer.shape[1:]

@@ -15,11 +15,11 @@ from numpy.typing import DTypeLike, NDArray
 from clra.errors import InputError, OutputError
 from clra.io.atomic import atomic_path
 from clra.io.hdf5 import open_hdf5, require, text
-from clra.io.reporting import Report, tell
 from clra.io.units import TO_MM, factor
 from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.io.volumes.tiff import tiff_layout, tiff_volume
 from clra.model.grid import VolumeGrid
+from clra.progress import ProgressCallback, tell
 
 HDF5 = (".h5", ".hdf5", ".nxs")
 TIFF = (".tif", ".tiff")
@@ -74,7 +74,7 @@ def write_volume(
     grid: VolumeGrid,
     *,
     units: str = "1/mm",
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> None:
     """Write a volume; the file appears whole or not at all.
 

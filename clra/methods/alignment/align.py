@@ -15,7 +15,8 @@ from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
-from clra.ops.streaming.stream import Report, Stream
+from clra.ops.streaming.stream import Stream
+from clra.progress import ProgressCallback
 
 METHODS = ("ra", "imgr", "reference")
 ESTIMATES = ("shift", "shift+scale", "source")
@@ -33,7 +34,7 @@ def align(
     reference: Scan | None = None,
     motion: Motion | None = None,
     truth: Motion | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     gauge: str = "anchored",
     solver: Solver | None = None,
     max_device_memory: int | None = None,
@@ -70,7 +71,7 @@ def align(
     truth : Motion, optional
         To report errors against; by default the scan's own, if it is a simulated one.
     progress : callable, optional
-        Called with a :class:`clra.ops.streaming.stream.Progress` as work goes on.
+        Called with a :class:`clra.progress.Progress` as work goes on.
     gauge : {"anchored", "free"}
         What becomes of the part of the motion that a movement of the sample as a whole (three
         translations, two tilts, a stretch along z) would explain as well. The data hardly see it,

@@ -34,7 +34,9 @@ from clra.ops.filtering.ramp import RampFilter, taper
 from clra.ops.projection.projector import BackProjector
 from clra.ops.registration.gauss_newton import SMALLEST
 from clra.ops.streaming.memory import DeviceMemoryError
-from clra.ops.streaming.stream import Radiographs, Report, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.progress import ProgressCallback
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +87,7 @@ def autofocus(
     scan: Scan,
     device: Any = None,
     *,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> Focus:
@@ -98,7 +100,7 @@ def autofocus(
     device : str or cl.Device, optional
         As :func:`clra.ops.runtime.devices.choose_device` takes it.
     progress : callable, optional
-        Called with a :class:`clra.ops.streaming.stream.Progress` as work goes on.
+        Called with a :class:`clra.progress.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 
@@ -158,7 +160,7 @@ def sharpening_by_turning_back(
     motion: Motion,
     device: Any = None,
     *,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> float:
@@ -176,7 +178,7 @@ def sharpening_by_turning_back(
     device : str or cl.Device, optional
         As :func:`clra.ops.runtime.devices.choose_device` takes it.
     progress : callable, optional
-        Called with a :class:`clra.ops.streaming.stream.Progress` as work goes on.
+        Called with a :class:`clra.progress.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
 

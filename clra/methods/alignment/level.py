@@ -13,8 +13,10 @@ from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.streaming.memory import Store
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
-from clra.ops.streaming.volume_slabs import SlabProjector
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import SlabProjector
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 
 @dataclass

@@ -10,7 +10,8 @@ from clra.methods.alignment.reprojection import SPREAD, registration_for
 from clra.model.scan import Scan
 from clra.ops.registration.gauss_newton import Registration
 from clra.ops.registration.phase_correlation import PhaseCorrelation
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 # Diagonal of the images, pixels, from which on re-projections are good as they are: at half of the
 # paper's resolution, 530 pixels, they are displaced by 0.008 pixel in v and 5e-5 in magnification.

@@ -11,7 +11,9 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 # Part of the field of view's radius, and planes of the volume, in which sharpness is measured.
 _INSIDE, _PLANES = 0.9, 9

@@ -35,7 +35,8 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.view_matching import match_views
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, SMALLEST
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,8 @@ from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from clra.model.motion import Motion
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 

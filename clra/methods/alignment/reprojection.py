@@ -15,8 +15,10 @@ from clra.model.scan import Scan
 from clra.model.schedule import level_name
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, SMALLEST, Registration
 from clra.ops.registration.phase_correlation import PhaseCorrelation
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
-from clra.ops.streaming.volume_slabs import SlabProjector
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import SlabProjector
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,9 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clra.ops.streaming.memory import host_memory
-from clra.ops.streaming.stream import PlaneWriter, Progress, Report, Stream
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import PlaneWriter
+from clra.progress import Progress, ProgressCallback
 
 Work = Callable[[Stream, slice, PlaneWriter], None]
 
@@ -32,7 +34,7 @@ def on_devices(
     planes: int,
     target: PlaneWriter,
     *,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> None:
@@ -49,7 +51,7 @@ def on_devices(
     target : PlaneWriter
         Takes the planes of the whole, from one device at a time.
     progress : callable, optional
-        Called with a :class:`clra.ops.streaming.stream.Progress` as work goes on, likewise.
+        Called with a :class:`clra.progress.Progress` as work goes on, likewise.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used: on each device, and on the host by all.
 
@@ -80,7 +82,7 @@ def on_devices(
 class _Share:
     """What the devices have in common."""
 
-    def __init__(self, target: PlaneWriter, progress: Report | None, parts: int) -> None:
+    def __init__(self, target: PlaneWriter, progress: ProgressCallback | None, parts: int) -> None:
         self.target, self.progress, self.parts = target, progress, parts
         self.lock = threading.Lock()
         self.stopped = False

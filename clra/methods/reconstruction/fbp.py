@@ -15,7 +15,9 @@ from clra.model.view_selection import runs, views_that_see
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage, around
 from clra.ops.projection.projector import BackProjector
-from clra.ops.streaming.stream import PlaneWriter, Radiographs, Stream, Volume
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import PlaneWriter, Volume
 
 
 def ramp_fbp(

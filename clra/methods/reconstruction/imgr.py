@@ -35,7 +35,8 @@ from clra.model.scan import Scan
 from clra.model.schedule import converged, level_name, parse_levels
 from clra.model.view_selection import sampled
 from clra.ops.streaming.multigrid import add_update, cropped
-from clra.ops.streaming.stream import Stream, Volume
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 # Cycles after which it ends in any case; without alignment a second one changes little.
 _CYCLES, _CYCLES_UNALIGNED = 3, 1

@@ -23,7 +23,9 @@ from clra.model.scan import Scan
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS
 from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import prolongate, restrict
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
 Believed = NDArray[np.bool_]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.model.motion import Motion
-from clra.ops.streaming.stream import Volume
+from clra.ops.streaming.volume import Volume
 
 
 @dataclass(frozen=True)

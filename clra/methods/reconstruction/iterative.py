@@ -15,7 +15,9 @@ from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.streaming.multigrid import cropped
-from clra.ops.streaming.stream import PlaneWriter, Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import PlaneWriter
 
 METHODS = ("osem-tr", "imgr")
 

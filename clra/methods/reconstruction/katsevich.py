@@ -16,7 +16,9 @@ from clra.model.helix.pi_intervals import field_of_view, pi_spans
 from clra.model.view_selection import runs, views_that_see
 from clra.ops.filtering.katsevich_filter import KatsevichFilter
 from clra.ops.projection.pi_backprojector import PiBackProjector
-from clra.ops.streaming.stream import PlaneWriter, Radiographs, Stream, Volume
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import PlaneWriter, Volume
 
 # Views of each helix with the helix, and the radius of the field of view [mm].
 Exact = tuple[list[tuple[slice, Helix]], float]

@@ -15,14 +15,16 @@ from clra.model.subsets import ordered_subsets
 from clra.model.validation import whole
 from clra.ops.statistics.poisson import RayStatistics, VolumeStep
 from clra.ops.streaming.multigrid import add_update
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
-from clra.ops.streaming.volume_slabs import (
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import (
     SlabAdjoint,
     SlabProjector,
     constant_volume,
     volume_from,
     writable,
 )
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 UPDATES = ("paraboloid", "optimal", "multiplicative")
 INITIAL = ("fbp", "uniform")

@@ -24,7 +24,10 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.validation import believed_views
 from clra.ops.runtime.devices import choose_devices
-from clra.ops.streaming.stream import HostPlanes, PlaneWriter, Radiographs, Report, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import HostPlanes, PlaneWriter
+from clra.progress import ProgressCallback
 
 METHODS = ("fbp", "katsevich", *iterative.METHODS)
 
@@ -38,7 +41,7 @@ def reconstruct(
     device: Any = None,
     *,
     believed: NDArray[np.bool_] | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
     **options: Any,
@@ -71,7 +74,7 @@ def reconstruct(
         those that are not flagged. "katsevich" needs every view: what lies between the radiographs
         beside stands in for the others, and for views that the scan lacks.
     progress : callable, optional
-        Called with a :class:`clra.ops.streaming.stream.Progress` as work goes on.
+        Called with a :class:`clra.progress.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used, see `Stream`. The volume that is returned
         comes on top: :func:`reconstruct_into` takes one larger than the memory.
@@ -120,7 +123,7 @@ def reconstruct_into(
     device: Any = None,
     *,
     believed: NDArray[np.bool_] | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
     **options: Any,

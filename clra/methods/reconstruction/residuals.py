@@ -7,7 +7,8 @@ from clra.model.motion import Motion
 from clra.ops.images.warp import Warp
 from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import Residual
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 

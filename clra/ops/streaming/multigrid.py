@@ -10,8 +10,9 @@ from clra.model.grid import VolumeGrid
 from clra.ops.images.pyramid import Prolong3D, Restrict3D
 from clra.ops.runtime import build
 from clra.ops.runtime.kernel import Step, to_device
-from clra.ops.streaming.stream import Stream, Volume
-from clra.ops.streaming.volume_slabs import writable
+from clra.ops.streaming.slab_projector import writable
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 _FILE = "multigrid.cl"
 
@@ -28,7 +29,7 @@ def prolongate(stream: Stream, coarse: Volume, grid: VolumeGrid, *, volumes: int
     grid : VolumeGrid
         Of the result.
     volumes : int
-        As for :class:`~clra.ops.streaming.stream.Volume`.
+        As for :class:`~clra.ops.streaming.volume.Volume`.
 
     Returns
     -------
@@ -59,7 +60,7 @@ def restrict(stream: Stream, fine: Volume, *, volumes: int = 1) -> Volume:
     fine : Volume
         To average; at the upper ends, voxels that fill no block are dropped.
     volumes : int
-        As for :class:`~clra.ops.streaming.stream.Volume`.
+        As for :class:`~clra.ops.streaming.volume.Volume`.
 
     Returns
     -------
@@ -91,7 +92,7 @@ def cropped(
     grid : VolumeGrid
         Of the planes.
     volumes : int
-        As for :class:`~clra.ops.streaming.stream.Volume`.
+        As for :class:`~clra.ops.streaming.volume.Volume`.
     """
     copy = _PlaneCopy(stream)
     part = Volume(stream, grid, volumes=volumes)

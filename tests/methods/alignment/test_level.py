@@ -13,8 +13,9 @@ from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.phantoms.ellipsoids import Ellipsoids
 from clra.ops.projection.projector import ForwardProjector
-from clra.ops.streaming.stream import Radiographs, Stream
-from clra.ops.streaming.volume_slabs import volume_from
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import volume_from
+from clra.ops.streaming.stream import Stream
 
 VIEWS = 121
 SAME = 1e-5  # of the largest magnitude

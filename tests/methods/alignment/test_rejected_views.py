@@ -10,7 +10,8 @@ from clra.methods.alignment.rejected_views import (
     odd_radiographs,
     outliers,
 )
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 
 def test_views_far_below_the_others_are_found():

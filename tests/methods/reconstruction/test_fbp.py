@@ -10,7 +10,8 @@ import clra
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 # The paper's simulation at an eighth of its resolution, all lengths as there.
 VIEWS, SHAPE, PIXEL = 432, (116, 64), 0.4544 * 8

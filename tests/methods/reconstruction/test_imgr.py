@@ -15,8 +15,9 @@ from clra.model.phantoms.ellipsoids import porous
 from clra.model.phantoms.perturbation import random_motion, smooth_motion
 from clra.model.view_selection import sampled
 from clra.ops.streaming.memory import Store
-from clra.ops.streaming.stream import Radiographs, Stream
-from clra.ops.streaming.volume_slabs import SlabProjector, volume_from
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import SlabProjector, volume_from
+from clra.ops.streaming.stream import Stream
 
 # The scan of the paper's section 3.2 at a twenty-fourth of its resolution.
 VIEWS, COLUMNS = 160, 96

@@ -14,7 +14,8 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.helix.fit import fit_helices
 from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
-from clra.ops.streaming.stream import Radiographs, Stream
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
 MEAN, RMS = 1e-3, 6e-3  # of the phantom's 1/mm, in flat regions
 BETTER = 5  # times smaller rms than ramp-FBP's

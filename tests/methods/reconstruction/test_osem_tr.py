@@ -10,8 +10,9 @@ import clra
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import porous
-from clra.ops.streaming.stream import Radiographs, Stream
-from clra.ops.streaming.volume_slabs import SlabProjector, volume_from
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import SlabProjector, volume_from
+from clra.ops.streaming.stream import Stream
 
 PHOTONS = 1e4
 # 4 x 7 x 7 voxels under 120 views of 10 x 20: small and well posed enough to converge.

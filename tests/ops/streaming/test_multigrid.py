@@ -6,8 +6,8 @@ import pytest
 
 from clra.model.grid import VolumeGrid
 from clra.ops.streaming.multigrid import Residual, add_update, cropped, prolongate, restrict
+from clra.ops.streaming.slab_projector import constant_volume, volume_from
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume_slabs import constant_volume, volume_from
 from tests.ops.images.test_pyramid import prolonged, restricted
 
 ROUNDING = 4e-7

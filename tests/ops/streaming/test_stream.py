@@ -8,7 +8,9 @@ from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid
 from clra.ops.runtime import build
 from clra.ops.streaming.memory import DeviceMemoryError
-from clra.ops.streaming.stream import Radiographs, Stream, Volume
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
 

@@ -12,7 +12,8 @@ from clra.model.grid import VolumeGrid
 from clra.model.view_selection import runs, views_that_see
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.streaming.memory import Reused
-from clra.ops.streaming.stream import Stream, Volume
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 
 def constant_volume(
@@ -29,7 +30,7 @@ def constant_volume(
     value : float
         Of every voxel.
     volumes : int
-        As for :class:`~clra.ops.streaming.stream.Volume`.
+        As for :class:`~clra.ops.streaming.volume.Volume`.
     """
     volume = Volume(stream, grid, volumes=volumes)
     for index, slab in enumerate(volume.slabs):
@@ -52,7 +53,7 @@ def volume_from(stream: Stream, grid: VolumeGrid, values: Any, *, volumes: int =
     values : array-like object, (nz, ny, nx)
         Sliced along z.
     volumes : int
-        As for :class:`~clra.ops.streaming.stream.Volume`.
+        As for :class:`~clra.ops.streaming.volume.Volume`.
 
     Raises
     ------

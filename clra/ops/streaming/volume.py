@@ -1,0 +1,139 @@
+"""Volumes that may lie in slabs on the host, and where their planes go."""
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+from numpy.typing import NDArray
+
+from clra.model.grid import VolumeGrid
+from clra.ops.projection.transpose import Planes, Transpose
+from clra.ops.streaming.memory import Store
+from clra.ops.streaming.stream import Stream, equal_runs
+
+Floats = NDArray[np.float32]
+
+
+class PlaneWriter(Protocol):
+    """Where a volume goes plane by plane, such as `SlabWriter`."""
+
+    def write(self, start: int, part: Floats, /) -> None:
+        """Take planes (n, y, x), the first of them plane `start` of the volume."""
+
+
+class Volume:
+    """A volume in the order (y, x, z), on the device if it fits, else in slabs on the host.
+
+    Parameters
+    ----------
+    stream : Stream
+        Where it lives.
+    grid : VolumeGrid
+        Of the whole volume.
+    volumes : int
+        How many of its kind the device has to hold at a time.
+    """
+
+    def __init__(self, stream: Stream, grid: VolumeGrid, *, volumes: int = 1) -> None:
+        self.grid = grid
+        self._stream = stream
+        self._planes = stream.slabs(grid, volumes)
+        self._known = [False] * len(self._planes)
+        self._whole: cl.array.Array | None = None
+        self._store: Store | None = None
+        self._transpose = Transpose(stream.context)
+
+    @property
+    def planes(self) -> list[slice]:
+        """Planes of the grid in each slab, bottom to top."""
+        return list(self._planes)
+
+    @property
+    def slabs(self) -> list[VolumeGrid]:
+        """Grid of each slab."""
+        return [self.grid.slab(planes.start, planes.stop) for planes in self._planes]
+
+    def put(self, index: int, part: cl.array.Array) -> None:
+        """Keep slab `index`: where it is if the volume is one slab, else on the host."""
+        self._known[index] = True
+        if len(self._planes) == 1:
+            self._whole = part
+            return
+        if self._store is None:
+            self._store = Store((math.prod(self.grid.shape),), self._stream.room)
+        start = self._start(index)
+        buffer: Any = part.base_data
+        for piece in self._pieces(part.size):
+            host = np.empty(piece.stop - piece.start, np.float32)
+            cl.enqueue_copy(
+                self._stream.queue, host, buffer, src_offset=part.offset + 4 * piece.start
+            )
+            self._store.write(start + piece.start, host)
+
+    def get(self, index: int) -> cl.array.Array:
+        """Slab `index` (ny, nx, planes) on the device."""
+        if not self._known[index]:
+            raise RuntimeError(f"slab {index} was not computed")
+        if self._whole is not None:
+            return self._whole
+        _, ny, nx = self.grid.shape
+        planes = self._planes[index]
+        shape = (ny, nx, planes.stop - planes.start)
+        start, store = self._start(index), self._store
+        assert store is not None
+        if store.in_memory:
+            return self._stream.upload(store.read(start, start + math.prod(shape)).reshape(shape))
+        slab = self._stream.empty(shape)
+        buffer: Any = slab.base_data
+        for piece in self._pieces(slab.size):
+            part = store.read(start + piece.start, start + piece.stop)
+            cl.enqueue_copy(self._stream.queue, buffer, part, dst_offset=4 * piece.start)
+        return slab
+
+    def write(self, target: PlaneWriter) -> None:
+        """Hand the whole volume on, (z, y, x), some planes at a time."""
+        for index in range(len(self._planes)):
+            self.write_slab(index, self.get(index), target)
+
+    def write_slab(self, index: int, part: cl.array.Array, target: PlaneWriter) -> None:
+        """Hand slab `index` on, some planes at a time, whether it is kept or not."""
+        ny, nx, nz = part.shape
+        stream = self._stream
+        count = min(nz, max(1, stream.budgets.piece // (4 * ny * nx)))
+        for start in range(0, nz, count):
+            n = min(count, nz - start)
+            planes = stream.empty((n, ny, nx))
+            self._transpose(
+                stream.queue,
+                Planes(planes, nx, nx * ny, n, nx),
+                Planes(part[:, :, start:], nx * nz, nz, nx, n),
+                ny,
+            )
+            target.write(self._planes[index].start + start, stream.download(planes))
+
+    def to_host(self) -> Floats:
+        """Return the whole volume as a numpy array (z, y, x)."""
+        target = HostPlanes(self.grid)
+        self.write(target)
+        return target.volume
+
+    def _start(self, index: int) -> int:
+        """First element of a slab in the store."""
+        return int(self._planes[index].start) * self.grid.shape[1] * self.grid.shape[2]
+
+    def _pieces(self, size: int) -> list[slice]:
+        return equal_runs(size, -(-size // max(1, self._stream.budgets.piece // 4)))
+
+
+class HostPlanes:
+    """Takes the planes of a volume into a numpy array."""
+
+    def __init__(self, grid: VolumeGrid) -> None:
+        self.grid = grid
+        self.volume: Floats = np.zeros(grid.shape, np.float32)
+
+    def write(self, start: int, part: Floats) -> None:
+        """Take planes (n, y, x) from plane `start` on."""
+        self.volume[start : start + len(part)] = part
