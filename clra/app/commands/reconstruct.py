@@ -205,7 +205,7 @@ def _imgr(
     from clra.methods.reconstruction.imgr import imgr
     from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
     from clra.methods.reconstruction.iterative import sorted_options
-    from clra.ops.runtime.devices import choose_devices
+    from clra.ops.runtime.devices import usable_devices
     from clra.ops.streaming.stream import Stream
 
     osem, cycle = sorted_options("imgr", options)
@@ -218,7 +218,7 @@ def _imgr(
         **options,
     }
     leftover = Leftover(out, scan, settings)
-    stream = Stream(choose_devices(console.device)[0], report=progress, **limits)
+    stream = Stream(usable_devices(console.device, progress)[0], report=progress, **limits)
     progressed = leftover.load(stream, grid) if resume else None
     try:
         found = imgr(

@@ -103,7 +103,7 @@ def _home() -> Path:
 
 
 def _temporary_folder(why: str) -> Path:
-    """The user's own folder among the temporary ones, which nobody else can write to."""
+    """Make the user's own folder among the temporary ones, which nobody else can write to."""
     try:
         parent = Path(tempfile.gettempdir())
         if problem := unusable(parent):
@@ -116,7 +116,7 @@ def _temporary_folder(why: str) -> Path:
             folder = Path(tempfile.mkdtemp(prefix="clra-"))
     except OSError as error:
         raise DeviceError(
-            f"no folder for compiled kernels: {why}; {error.filename or ''}{error.strerror or error}"
-            ": free some space, or set XDG_CACHE_HOME to a folder that you can write to"
+            f"no folder for compiled kernels: {why}; {error}: free "
+            "some space, or set XDG_CACHE_HOME to a folder that you can write to"
         ) from error
     return folder

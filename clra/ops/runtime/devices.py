@@ -3,7 +3,6 @@
 import os
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import pyopencl as cl
@@ -11,6 +10,7 @@ import pyopencl as cl
 from clra.errors import ClraWarning, DeviceError
 from clra.ops.runtime import intel_driver, self_test
 from clra.ops.runtime.cache_folder import cache_folder
+from clra.progress import ProgressCallback
 
 _INSTALL = (
     "install a GPU driver with OpenCL, or for the CPU PoCL (pip install 'clra[pocl]', or apt-get "
@@ -34,6 +34,8 @@ class DeviceInfo:
         Bytes of global memory and of the largest single allocation.
     compute_units : int
         Cores of a CPU, multiprocessors of a GPU.
+    driver : str
+        Version of the driver, in short.
     """
 
     index: str
@@ -44,6 +46,7 @@ class DeviceInfo:
     memory: int
     largest_buffer: int
     compute_units: int
+    driver: str
 
 
 def _all_devices() -> list[tuple[str, cl.Device]]:
@@ -89,6 +92,7 @@ def devices() -> list[DeviceInfo]:
             memory=device.global_mem_size,
             largest_buffer=device.max_mem_alloc_size,
             compute_units=device.max_compute_units,
+            driver=_driver(device),
         )
         for index, device in _all_devices()
     ]
@@ -154,7 +158,7 @@ def device_at(index: str) -> cl.Device:
 
 
 def usable_device(
-    device: str | cl.Device | None = None, announce: Callable[[str], None] | None = None
+    device: str | cl.Device | None = None, progress: ProgressCallback | None = None
 ) -> cl.Device:
     """Select one device that passes the self-test.
 
@@ -163,8 +167,8 @@ def usable_device(
     device : str or cl.Device, optional
         As :func:`choose_device` takes it. A device that was asked for, here or by the environment,
         is taken or refused; by default the next best stands in for one that fails.
-    announce : callable, optional
-        Called with a line before a test, which takes some seconds, once a device and machine.
+    progress : callable, optional
+        Told before a test, which takes some seconds, once a device and machine.
 
     Returns
     -------
@@ -182,15 +186,15 @@ def usable_device(
     """
     chosen = choose_device(device)
     found = _all_devices()
-    problem = _problem(chosen, found, announce)
+    problem = _problem(chosen, found, progress)
     if not problem:
         return chosen
     others = sorted((d for _, d in found if d != chosen), key=_rank, reverse=True)
     if device is None and not _asked_for():
         for other in others:
-            if not _problem(other, found, announce):
+            if not _problem(other, found, progress):
                 warnings.warn(
-                    f"{problem}: {other.name.strip()} ({_short_version(other)}) is used instead",
+                    f"{problem}: {other.name.strip()} ({_driver(other)}) is used instead",
                     ClraWarning,
                     stacklevel=2,
                 )
@@ -204,7 +208,7 @@ def usable_device(
 def _problem(
     device: cl.Device,
     found: list[tuple[str, cl.Device]],
-    announce: Callable[[str], None] | None,
+    progress: ProgressCallback | None,
 ) -> str:
     """One line about a device that fails the self-test, else nothing."""
     root = device
@@ -213,15 +217,15 @@ def _problem(
     index = next((index for index, other in found if other == root), None)
     if index is None:  # of a platform that the loader does not list
         return ""
-    failure = self_test.verdict(root, index, announce).failure
-    return failure and (
-        f"{root.name.strip()} ({_short_version(root)}) fails clra's self-test: {failure}"
-    )
+    failure = self_test.verdict(root, index, progress).failure
+    return failure and (f"{root.name.strip()} ({_driver(root)}) fails clra's self-test: {failure}")
 
 
-def _short_version(device: cl.Device) -> str:
-    # some drivers add a list of everything they were built with
-    return str(device.platform.version).strip().partition("  ")[0]
+def _driver(device: cl.Device) -> str:
+    """Platform's version, without what some add of everything they were built with."""
+    version = str(device.platform.version).strip().partition("  ")[0]
+    own = str(device.driver_version).strip()
+    return version if own in version else f"{version}, {own}"
 
 
 def _asked_for() -> str | None:
@@ -229,7 +233,7 @@ def _asked_for() -> str | None:
 
 
 def usable_devices(
-    device: str | cl.Device | None = None, announce: Callable[[str], None] | None = None
+    device: str | cl.Device | None = None, progress: ProgressCallback | None = None
 ) -> list[cl.Device]:
     """Select the devices that share some work, all of which pass the self-test.
 
@@ -238,7 +242,7 @@ def usable_devices(
     device : str or cl.Device, optional
         "all": the default device and those of its kind and platform. Else as
         :func:`usable_device` takes it, which selects one.
-    announce : callable, optional
+    progress : callable, optional
         As for :func:`usable_device`.
 
     Returns
@@ -251,15 +255,15 @@ def usable_devices(
         As :func:`usable_device` does.
     """
     if device != "all":
-        return [usable_device(device, announce)]
-    first = usable_device(announce=announce)
+        return [usable_device(device, progress)]
+    first = usable_device(progress=progress)
     found = _all_devices()
     return [
         other
         for _, other in found
         if other.platform == first.platform
         and _kind(other) == _kind(first)
-        and not _problem(other, found, announce)
+        and not _problem(other, found, progress)
     ]
 
 

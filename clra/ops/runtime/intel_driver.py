@@ -49,13 +49,15 @@ def find() -> Path | None:
     """Intel's driver in this Python's environment; None if it is not installed."""
     if sys.platform != "linux":
         return None
-    places = (Path(prefix) / "lib" / "libintelocl.so" for prefix in (sys.prefix, site.USER_BASE or ""))
+    places = (
+        Path(prefix) / "lib" / "libintelocl.so" for prefix in (sys.prefix, site.USER_BASE or "")
+    )
     return next((place for place in places if place.exists()), None)
 
 
 def registered(*folders: Path) -> dict[str, str]:
     """Drivers registered in some folders, by file name, without those that are not there."""
-    texts = {}
+    texts: dict[str, str] = {}
     for folder in folders:
         for file in sorted(folder.glob("*.icd")):
             try:
@@ -63,7 +65,7 @@ def registered(*folders: Path) -> dict[str, str]:
             except (OSError, UnicodeDecodeError):
                 continue
             library = text.strip()
-            # Intel's packages leave files behind that name a folder of the machine they were made on.
+            # Intel's packages leave files that name a folder of the machine they were made on.
             if not library.startswith("/") or Path(library).exists():
                 texts.setdefault(file.name, text)
     return texts

@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +22,7 @@ import pyopencl as cl
 from clra.errors import DeviceError
 from clra.ops.runtime import pocl
 from clra.ops.runtime.cache_folder import cache_folder
+from clra.progress import ProgressCallback, tell
 
 VARIABLE = "CLRA_SELF_TEST"  # 0 turns it off
 SECONDS = 60.0  # the trial takes 4 to 10, most of it for building
@@ -73,7 +73,7 @@ def identity(device: cl.Device) -> list[str]:
 def verdict(
     device: cl.Device,
     index: str,
-    announce: Callable[[str], None] | None = None,
+    progress: ProgressCallback | None = None,
     *,
     anew: bool = False,
     rate: bool = False,
@@ -86,8 +86,8 @@ def verdict(
         A root device.
     index : str
         "platform:device", by which another process finds it.
-    announce : callable, optional
-        Called with a line before a trial, which takes some seconds.
+    progress : callable, optional
+        Told before a trial, which takes some seconds.
     anew : bool
         Have a trial in any case.
     rate : bool
@@ -104,8 +104,7 @@ def verdict(
         found = None if anew else _verdicts.get(key) or _read(key)
         if found is None:
             _log.info("%s: %s", STAGE, device.name.strip())
-            if announce:
-                announce(STAGE)
+            tell(progress, STAGE, 0, 1)
             found = _tried(device, index, rate)
             _keep(key, found)
         _verdicts[key] = found
@@ -158,10 +157,9 @@ def _run_child(request: str) -> tuple[int | None, str, str]:
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         VARIABLE: "0",
     }
-    command = [sys.executable, "-P", "-m", "clra.ops.runtime.trial", request]
     try:
         child = subprocess.Popen(
-            command,
+            _command(request),
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -179,6 +177,10 @@ def _run_child(request: str) -> tuple[int | None, str, str]:
     finally:
         _end(child)
     return child.returncode, out, errors
+
+
+def _command(request: str) -> list[str]:
+    return [sys.executable, "-P", "-m", "clra.ops.runtime.trial", request]
 
 
 def _end(child: "subprocess.Popen[str]") -> None:

@@ -62,12 +62,13 @@ Case = Callable[[cl.CommandQueue], tuple[Floats, Floats]]
 
 
 def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
-    """Conversions and arithmetic in vectors of 8 and 16, beside numpy's."""
+    """Conversions and arithmetic in vectors of 8 and 16, and numpy's."""
     numbers = np.random.default_rng(0).integers(-90_000, 90_000, (64, 16), np.int32)
     program = _program(queue)
     out = cl_array.empty(queue, (64, 32), np.float32)
     given = cl_array.to_device(queue, numbers)
-    cl.Kernel(program, "vectors")(queue, (64,), None, out.data, given.data)
+    kernel: Any = cl.Kernel(program, "vectors")
+    kernel(queue, (64,), None, out.data, given.data)
     single = numbers.astype(np.float32)
     sums = single.astype(np.float64) * 0.5 + np.floor(single * np.float32(0.3))
     truncated = np.trunc(single[:, :8] * np.float32(0.7))
@@ -76,8 +77,8 @@ def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
 
 
 def running_sums(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
-    """Sums over a work-group through local memory."""
-    kernel = cl.Kernel(_program(queue), "running_sums")
+    """Cumulative sums over work-groups, through local memory."""
+    kernel: Any = cl.Kernel(_program(queue), "running_sums")
     (size,) = build.work_group_size(kernel, queue.device, (32,))
     numbers = np.arange(3 * size, dtype=np.int32) % 7
     out = cl_array.empty(queue, numbers.shape, np.float32)
@@ -128,7 +129,7 @@ def back_projection(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
 
 
 def adjoint(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
-    """<A x, y> = <x, A' y> for the projector and its transpose."""
+    """Inner products <A x, y> and <x, A' y> of the projector A and its transpose."""
     geometry, random = _geometry(), np.random.default_rng(1)
     shape = (_VIEWS, *_SHAPE)
     x = cl_array.to_device(queue, random.random(_GRID.shape, np.float32))
@@ -145,7 +146,7 @@ def adjoint(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
 
 
 def registration(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
-    """The shift between two images of the same Gaussians, in pixels."""
+    """Shift between two images of the same Gaussians, in pixels."""
     shape = (48, 64)
     measured, simulated = (
         cl_array.to_device(queue, _gaussians(shape, shift).astype(np.float32)[np.newaxis])
@@ -240,7 +241,7 @@ def _geometry() -> ConeBeamGeometry:
 
 
 def _centres(n: int) -> Floats:
-    return (np.arange(n) - (n - 1) / 2) * _GRID.voxel_size
+    return np.asarray((np.arange(n) - (n - 1) / 2) * _GRID.voxel_size, np.float64)
 
 
 def _line_integrals(
