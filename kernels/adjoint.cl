@@ -3,10 +3,10 @@
 //
 // For a ray that is sampled across axis p and passes the voxel's plane at (q, l), the share is
 // hat(q - q of the voxel) hat(l - l of the voxel), hat(x) = max(0, 1 - |x|), times the length of
-// ray between two planes, by which weigh_rays multiplies the projections beforehand.
+// ray between two planes, by which weigh_rays multiplies the projections in advance.
 //
-// adjoint_voxels tries, for a voxel, the pixels of the bounding box of its support's shadow. CPUs
-// run adjoint_columns.cl or adjoint_tilted.cl instead, and leave it the rays sampled across z.
+// adjoint_voxels tries, for a voxel, the pixels of the bounding box of its support's projection.
+// CPUs run adjoint_columns.cl or adjoint_tilted.cl instead, and leave it the rays sampled across z.
 // Every voxel, and the one beyond, has to be in front of every source.
 
 #include "geometry.clh"
@@ -64,7 +64,7 @@ static inline float gather(
     const float a = AT(m, voxel[0], voxel[1], voxel[2]);
     const float b = AT(m + 4, voxel[0], voxel[1], voxel[2]);
     const float g = AT(m + 8, voxel[0], voxel[1], voxel[2]);
-    // the shadow of the square in which rays share in the voxel
+    // the projection of the square in which rays share in the voxel
     float left = INFINITY, right = -INFINITY, top = INFINITY, bottom = -INFINITY;
     for (int corner = 0; corner < 4; ++corner) {
         const float dq = corner & 1 ? 1.0f : -1.0f;

@@ -5,7 +5,7 @@
 // A work-item sums one voxel over the given views. Every voxel has to be in front of every source
 // (g > 0). CPUs run backproject_columns.cl and backproject_tilted.cl instead.
 
-#include "panel.clh"
+#include "detector.clh"
 
 // Global size (nz, nx, ny), rounded up at will.
 kernel void backproject_voxels(
@@ -39,7 +39,7 @@ kernel void backproject_voxels(
         const float scale = 1.0f / AT(m + 8, x, y, z);
         const float column = AT(m, x, y, z) * scale;
         const float row = AT(m + 4, x, y, z) * scale;
-        sum += on_panel(image, columns, rows, pitch, column, row) * scale * scale;
+        sum += on_detector(image, columns, rows, pitch, column, row) * scale * scale;
     }
     volume += ((size_t)y * nx + x) * nz + z;
     *volume = accumulate ? *volume + sum : sum;

@@ -56,7 +56,7 @@ kernel void backproject_columns(
         const float row =
             fma(m[4], (float)x, fma(m[5], (float)y, fma(m[6], (float)z, m[7]))) * scale;
         const float slope = m[6] * scale;
-        // the voxels at the panel's first and last row
+        // the voxels at the detector's first and last row
         const float per_row = 1.0f / slope;
         const float one = -row * per_row;
         const float other = (last_row - row) * per_row;
@@ -86,7 +86,7 @@ kernel void backproject_columns(
             const whole at = step_lanes(step);
             const piece both = blend(line_weight, line + base, next_weight, next + base);
             real value = between(both, whole_part(at), fraction(at));
-            if (k == start || k + LANES >= stop) { // only here may lanes be off the panel
+            if (k == start || k + LANES >= stop) { // only here may lanes be off the detector
                 const real r = slope * ((float)k + RAMP) + row;
                 value = WHERE((r >= 0.0f) & (r <= last_row), value);
             }

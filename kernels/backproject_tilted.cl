@@ -1,13 +1,13 @@
-// backproject.cl for CPUs and any views. The shadow of a line of voxels along z is a straight line
-// on the panel, which slowly passes from one detector column to the next. So LANES successive
-// voxels are interpolated at once, mostly between two columns; where their shadow crosses a column,
-// among as many as it takes.
+// backproject.cl for CPUs and any views. The projection of a line of voxels along z is a straight
+// line on the detector, which slowly passes from one detector column to the next. So LANES
+// successive voxels are interpolated at once, mostly between two columns; where their projection
+// crosses a column, among as many as it takes.
 //
 // A work-item sums BLOCK voxels along z over the given views. Every voxel has to be in front of
 // every source (g > 0).
 
 #include "blocks.clh"
-#include "panel.clh"
+#include "detector.clh"
 
 #ifndef STRIP
 #define STRIP 32 // as in backproject_columns.cl
@@ -48,7 +48,7 @@ static inline void add_shadow(
             const float scale = 1.0f / fma(m[10], (float)k, g);
             const float column = fma(m[2], (float)k, a) * scale;
             const float row = fma(m[6], (float)k, b) * scale;
-            sum[k] += on_panel(image, columns, rows, pitch, column, row) * scale * scale;
+            sum[k] += on_detector(image, columns, rows, pitch, column, row) * scale * scale;
         }
         return;
     }
@@ -78,7 +78,7 @@ static inline void add_shadow(
                 break;
             const int edge = k < first || k + LANES > last + 1;
             real t = (float)k + RAMP;
-            if (edge) // lanes off the panel take the place of one on it
+            if (edge) // lanes off the detector take the place of one on it
                 t = SMALLER(LARGER(t, (real)(first)), (real)(last));
             const real scale = 1.0f / (m[10] * t + g);
             const real column = (m[2] * t + a) * scale;

@@ -1,11 +1,11 @@
 // Band-pass of images: difference of two Gaussians, as the coefficients of a cubic B-spline.
 //
 // D(q) = sum_p c(p) b(q - p) at any real position q, b the cubic B-spline (variance 1/3 pixel^2),
-// c = (h * MI) / (h * M) - W, M the mask (0 outside the panel), I the image, h narrow. W(p) is the
-// value at p of the plane that fits the image best with the weights H(q - p) M(q), H wide: a plain
-// Gaussian filter within, and next to masks and borders no slope turns into structure. W is made of
-// means over blocks of `factor` pixels and brought back with cubic B-splines; block mean, coarse
-// Gaussian and both splines add up to its variance.
+// c = (h * MI) / (h * M) - W, M the mask (0 outside the detector), I the image, h narrow. W(p) is
+// the value at p of the plane that fits the image best with the weights H(q - p) M(q), H wide: a
+// plain Gaussian filter within, and next to masks and borders no slope turns into structure. W is
+// made of means over blocks of `factor` pixels and brought back with cubic B-splines; block mean,
+// coarse Gaussian and both splines add up to its variance.
 //
 // Steps: block_means, wide_rows, wide_columns, expand_columns, narrow_rows, bandpass_columns. A
 // work-item makes LANES columns of one row, in block_means one pixel. Global sizes are (columns or
@@ -88,7 +88,7 @@ kernel void wide_rows(
     store_unaligned(moment, first + at);
 }
 
-// The fitted plane's value: a combination, known beforehand, of the image's weighted moments.
+// The fitted plane's value: a combination, known in advance, of the image's weighted moments.
 kernel void wide_columns(
     global float *restrict wide, // lined (views, rows, stride), rows and columns of blocks
     const ulong wide_offset,
@@ -133,7 +133,7 @@ kernel void wide_columns(
 }
 
 // Cubic B-spline through coarse columns, at every fine column, in the coarse rows. LANES columns
-// lean on `span` coarse ones, whose weights are known beforehand.
+// lean on `span` coarse ones, whose weights are known in advance.
 kernel void expand_columns(
     global float *restrict expanded, // lined (views, coarse_rows, stride)
     const ulong expanded_offset,

@@ -1,6 +1,6 @@
 // Gaussian blur of lined images (see lanes.clh), one direction a kernel.
 //
-// Beyond the border there is nothing: what is left of the taps on the panel is scaled up to 1. A
+// Beyond the border there is nothing: what is left of the taps on the detector is scaled up to 1. A
 // work-item makes LANES columns of one row; global size (blocks of LANES columns, rows, views),
 // rounded up at will.
 
@@ -45,7 +45,7 @@ kernel void blur_columns(
     global const float *restrict taps, // (2 radius + 1,)
     const ulong taps_offset,
     const int radius, // columns
-    global const float *restrict part, // lined (1, stride): 1 / taps on the panel, 0 off it
+    global const float *restrict part, // lined (1, stride): 1 / taps on the detector, 0 off it
     const ulong part_offset,
     const int rows,
     const int columns,

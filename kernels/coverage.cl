@@ -1,10 +1,10 @@
 // Views that see a voxel, W, on a coarse grid; and a volume divided by it.
 //
 // W(x) = sum over views of the view's weight times that of the row that x falls on, linear between
-// rows, 0 for a view on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie. It
-// varies over many voxels, so that it is computed once for a block of them, in its middle, and
-// interpolated linearly. The last block of an axis may be cut short by the grid's end: its middle
-// is `last` in units of whole blocks, at most their number less 1.
+// rows, 0 for a view on whose detector [0, columns - 1] x [0, rows - 1] the projection does not
+// lie. It varies over many voxels, so that it is computed once for a block of them, in its middle,
+// and interpolated linearly. The last block of an axis may be cut short by the grid's end: its
+// middle is `last` in units of whole blocks, at most their number less 1.
 //
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
 // normalise one a voxel, along the volume's axes from last to first.
@@ -43,7 +43,7 @@ kernel void coverage(
         const float b = m[4] * x + m[5] * y + m[6] * z + m[7];
         const float g = m[8] * x + m[9] * y + m[10] * z + m[11];
         const float column = a / g, row = b / g;
-        // Written so that a NaN is not on the panel.
+        // Written so that a NaN is not on the detector.
         const int on = g > 0.0f && column >= 0.0f && column <= columns - 1.0f && row >= 0.0f &&
                        row <= rows - 1.0f;
         const int r = on ? min((int)row, rows - 2) : 0;

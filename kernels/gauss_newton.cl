@@ -8,7 +8,7 @@
 // x2 = -g h dm/m: five linear unknowns, no gain to be carried on.
 //
 // A round is gauss_newton_sums.cl (sums over the image), then advance (one work-item a view solves
-// and moves on). Coordinates are pixels from the centre of the first; c is the panel's centre.
+// and moves on). Coordinates are pixels from the centre of the first; c is the detector's centre.
 // `state` keeps STATE floats a view, see gauss_newton.clh.
 
 #include "lanes.clh"

@@ -42,12 +42,12 @@ typedef struct {
     float2 shift;
     float growth; // 1/m - 1
     float inverse_radius; // 1/h, 1/pixels
-} twins;
+} counterparts;
 
 // The spline and its derivatives along x and y, u and f past the second of four by four
 // coefficients, whose first are those of column x - 1 and row y - 1.
 __attribute__((always_inline)) static inline void
-spline_at(const twins s, const int x, const int y, const floatn u, const float f, floatn *b,
+spline_at(const counterparts s, const int x, const int y, const floatn u, const float f, floatn *b,
           floatn *p, floatn *q)
 {
     *b = *p = *q = 0.0f;
@@ -91,7 +91,7 @@ spline_at(const twins s, const int x, const int y, const floatn u, const float f
 // the knot, where the piece differs from its neighbour by the cube of that only. So no lane loads
 // from an address of its own.
 __attribute__((always_inline)) static inline floatn
-terms_at(const twins s, const int j, const int i, floatn term[TERMS])
+terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
 {
     const float2 centre = 0.5f * (float2)(s.columns - 1, s.rows - 1);
     // Displacements, not positions, are interpolated at: they keep all their digits.
@@ -101,7 +101,7 @@ terms_at(const twins s, const int j, const int i, floatn term[TERMS])
     const float f = dy - floor(dy);
     const float middle =
         (i + 0.5f * (LANES - 1) - centre.x) * s.growth - s.shift.x * (1.0f + s.growth);
-    // Far outside the panel all is 0 anyway.
+    // Far outside the detector all is 0 anyway.
     const int x = clamp(i + (int)floor(middle), -LANES - 4, s.columns + 3);
     const floatn lanes = load_lanes(lane_numbers);
     const floatn u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * s.growth;
@@ -154,7 +154,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     if (state[DONE] != 0.0f)
         return; // the whole work-group leaves
 
-    const twins s = {
+    const counterparts s = {
         coefficients + coefficients_offset + (ulong)view * rows * stride,
         measured + measured_offset + (ulong)view * rows * stride,
         window + window_offset,

@@ -1,10 +1,10 @@
 // The filter of Katsevich's reconstruction from a helix, as Noo, Pack and Heuscher give it for flat
-// panels: derivative along the helix at constant direction, and resampling to filter lines and
+// detectors: derivative along the helix at constant direction, and resampling to filter lines and
 // back. The Hilbert transform along the lines comes between these two.
 //
-// Positions on the panel are tangents, t_u along rows and t_v along z, of the angle to its normal.
-// A work-item makes LANES columns of one line. Global sizes are (blocks of LANES columns, lines,
-// views), rounded up at will.
+// Positions on the detector are tangents, t_u along rows and t_v along z, of the angle to its
+// normal. A work-item makes LANES columns of one line. Global sizes are (blocks of LANES columns,
+// lines, views), rounded up at will.
 
 #include "unaligned.clh"
 
@@ -37,7 +37,7 @@ kernel void differentiate(
     const ulong projections_offset,
     const int columns,
     const int rows,
-    const int first, // row of the panel from which on, >= 0
+    const int first, // row of the detector from which on, >= 0
     const int height, // < rows - first
     const int views,
     const float principal_column, // foot of the perpendicular from the source [pixel]
@@ -72,7 +72,7 @@ kernel void differentiate(
 }
 
 // Along filter line n, columns j of the derivative's rows position[2n] + position[2n + 1] j. Beyond
-// the panel's first and last row these go on. Zeros follow up to `padded`.
+// the detector's first and last row these go on. Zeros follow up to `padded`.
 kernel void take_lines(
     global float *restrict lines, // (views, count, padded)
     const ulong lines_offset,
@@ -107,7 +107,7 @@ kernel void take_lines(
         value, lines + ((ulong)view * count + line) * padded + i, min(LANES, padded - i));
 }
 
-// From filtered lines back to rows and columns of the panel: out(row, j) is column j of line
+// From filtered lines back to rows and columns of the detector: out(row, j) is column j of line
 // position(row, j).
 kernel void put_lines(
     global float *restrict out, // (views, rows, columns)

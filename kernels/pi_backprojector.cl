@@ -1,11 +1,11 @@
 // Back-projection over pi-intervals, for exact helical reconstruction:
 // volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
-// bilinearly at the voxel's shadow.
+// bilinearly at the voxel's projection.
 //
 // chi is 1 inside the Tam-Danielsson window, whose borders `window` gives by column, 0 outside. At
-// a border it falls linearly over as much as the shadow moves from view to view, so that a voxel's
-// first and last view count by the part of them that belongs to its pi-interval, and one row more,
-// over which p is interpolated.
+// a border it falls linearly over as much as the projection moves from view to view, so that a
+// voxel's first and last view count by the part of them that belongs to its pi-interval, and one
+// row more, over which p is interpolated.
 //
 // weight shares voxels among helices. Of each, `spans` gives the heights above each (x, y) whose
 // pi-interval it holds; towards their ends its part falls linearly over BLEND voxels. Voxels that

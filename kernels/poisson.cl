@@ -1,11 +1,11 @@
 // Statistics of transmission data, and the updates of a volume that follow from them.
 //
-// A ray with line integral l is expected to count q = b exp(-l) + r photons: b are those of the open
-// beam, r is background. What was measured is given as line integral p, so that y = b exp(-p) + r
-// counts were found. A masked pixel has b = 0: it then has neither gradient nor curvature.
+// A ray with line integral l is expected to count q = b exp(-l) + r photons: b are those of the
+// open beam, r is background. What was measured is given as line integral p, so that y = b exp(-p)
+// + r counts were found. A masked pixel has b = 0: it then has neither gradient nor curvature.
 //
-// Kernels of rays: one work-item a pixel of a radiograph (`deviance`: of the panel, for all views);
-// global size (pixels, views). Kernels of voxels: one a voxel. Ranges may be rounded up.
+// Kernels of rays: one work-item a pixel of a radiograph (`deviance`: of the detector, for all
+// views); global size (pixels, views). Kernels of voxels: one a voxel. Ranges may be rounded up.
 
 // Line integrals are taken to lie in this range: a hot pixel may show more than the open beam, and
 // none tells less than exp(-30).
@@ -24,7 +24,7 @@ static inline float excess(const float open_beam, const float simulated, const f
     return expected(open_beam, p) * expm1(p - l);
 }
 
-// Adds, for each pixel of the panel, the Poisson deviance 2 (q - y + y log(y / q)) of all views.
+// Adds, for each pixel of the detector, the Poisson deviance 2 (q - y + y log(y / q)) of all views.
 kernel void deviance(
     global float *restrict sums, // (pixels)
     const ulong sums_offset,

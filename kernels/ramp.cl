@@ -2,8 +2,8 @@
 //
 // A line of detector row r is p(c) * factor * row_weight(r) / sqrt(1 + a du^2 + b dv^2 + s du dv),
 // du = c - c0 and dv = r - r0 pixels from the principal point: the root is the length of the ray
-// over the distance from source to panel. Past the panel a line runs out from its outermost values,
-// the last going right and, cyclically, the first going left, each times `roll`.
+// over the distance from source to detector. Past the detector a line runs out from its outermost
+// values, the last going right and, cyclically, the first going left, each times `roll`.
 //
 // Lines are numbered through all views: line = view * rows + row. A work-item makes LANES columns
 // of one line. Global sizes are (blocks of LANES columns, lines), rounded up at will.
@@ -38,7 +38,7 @@ kernel void weight_lines(
     const ulong view_table_offset, // of the projections' first view
     global const float *restrict row_weight, // (rows,)
     const ulong row_weight_offset,
-    global const float *restrict roll, // (padded - columns,): what columns past the panel keep
+    global const float *restrict roll, // (padded - columns,): what columns past the detector keep
     const ulong roll_offset,
     const int first, // line of the projections that becomes line 0
     const int count,
@@ -70,7 +70,7 @@ kernel void weight_lines(
         store_unaligned(load_unaligned(p + i) * weights_at(w, i), lines);
         return;
     }
-    // From here on columns lie left of the panel rather than right of it.
+    // From here on columns lie left of the detector rather than right of it.
     const int middle = columns + (padded - columns) / 2;
     if (i >= columns && i + LANES <= padded && (i + LANES <= middle || i >= middle)) {
         const int from = i < middle ? columns - 1 : 0;

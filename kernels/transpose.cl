@@ -6,8 +6,8 @@
 // is filled with zeros. TILE x TILE elements go through local memory, so that neighbouring
 // work-items read and write neighbours; for CPUs (LANES 8) through private memory of one work-item.
 //
-// A work-group moves one tile. Global size: (ceil(length / TILE), ceil(lines / TILE), planes) groups
-// or more of local size (any, 1, 1), with LANES 8 of (1, 1, 1).
+// A work-group moves one tile. Global size: (ceil(length / TILE), ceil(lines / TILE), planes)
+// groups or more of local size (any, 1, 1), with LANES 8 of (1, 1, 1).
 
 #ifndef LANES
 #define LANES 1 // 1 or 8

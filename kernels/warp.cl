@@ -33,7 +33,7 @@ static inline int mirrored(int i, const int n)
 static inline int position(
     const int i, const int n, const float shift, const float magnification, float *fraction)
 {
-    // The displacement, not the position, keeps its digits on wide panels.
+    // The displacement, not the position, keeps its digits on wide detectors.
     const float wanted = (magnification - 1.0f) * (i - 0.5f * (n - 1)) + shift;
     const float displacement = clamp(wanted, (float)-i, (float)(n - 1 - i));
     const float whole = floor(displacement);

@@ -6,7 +6,7 @@ from clra.model.geometry import ConeBeamGeometry
 
 
 def tilted(seed=0, views=5, unit=1.0, shape=(37, 51)) -> ConeBeamGeometry:
-    """Panels in general position, tilted, skewed and off centre, that look at about the origin."""
+    """Detectors in general position, tilted and skewed, that look at about the origin."""
     random = np.random.default_rng(seed)
     angle = 2 * np.pi * random.random(views)
     out = np.stack([np.sin(angle), -np.cos(angle), 0 * angle], axis=1)
@@ -22,7 +22,7 @@ def tilted(seed=0, views=5, unit=1.0, shape=(37, 51)) -> ConeBeamGeometry:
 
 
 def upside_down(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-    """The same panels with their rows counted the other way."""
+    """The same detectors with their rows counted the other way."""
     return ConeBeamGeometry(
         source=geometry.source,
         detector=geometry.detector,

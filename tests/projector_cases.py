@@ -19,7 +19,7 @@ forms = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
 NARROW = {"narrow columns": {"_lanes": 8}, "narrow tilted": {"_lanes": 8, "_tilted": True}}
 all_forms = pytest.mark.parametrize("form", [*FORMS.values(), *NARROW.values()], ids=FORMS | NARROW)
 
-PANEL = {
+DETECTOR = {
     "source_to_axis": 60.0,
     "source_to_detector": 100.0,
     "pixel_size": 2.3,
@@ -29,7 +29,7 @@ GRID = VolumeGrid(shape=(19, 11, 14), voxel_size=1.3, centre=(1.1, -0.7, 0.6))
 
 
 def perturbed(geometry: ConeBeamGeometry, size: float, seed: int = 3) -> ConeBeamGeometry:
-    """Source, panel and its sides moved at random by up to `size` pixels a view."""
+    """Source, detector and its sides moved at random by up to `size` pixels a view."""
     random = np.random.default_rng(seed)
 
     def moved(vectors: np.ndarray, by: float) -> np.ndarray:
@@ -65,17 +65,19 @@ def off_centre(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
 
 
 GEOMETRIES = {
-    "circle": circular(8, start=0.1, **PANEL),  # an axis tied at 45 degrees has two right answers
-    "helix": helix(7, angle_step=0.9, z_step=2.1, **PANEL),
-    "space-filling": space_filling(7, z_step=0.9, angle_step=2.4, **PANEL),
-    "v down": upside_down(helix(5, angle_step=1.1, z_step=1.3, **PANEL)),
-    "off centre": off_centre(circular(6, start=0.3, **PANEL)),
-    "fine pixels": circular(3, start=0.2, **PANEL | {"pixel_size": 0.4, "shape": (47, 41)}),
-    "coarse pixels": circular(5, start=0.2, **PANEL | {"pixel_size": 9.0, "shape": (5, 4)}),
-    "one row": circular(4, start=0.4, **PANEL | {"shape": (1, 19)}),
-    "one column": circular(4, start=0.4, **PANEL | {"shape": (15, 1)}),
-    "little tilt": perturbed(circular(6, **PANEL), 0.1),
-    "tilted": perturbed(helix(6, angle_step=1.1, z_step=1.3, **PANEL), 1.0),
+    "circle": circular(
+        8, start=0.1, **DETECTOR
+    ),  # an axis tied at 45 degrees has two right answers
+    "helix": helix(7, angle_step=0.9, z_step=2.1, **DETECTOR),
+    "space-filling": space_filling(7, z_step=0.9, angle_step=2.4, **DETECTOR),
+    "v down": upside_down(helix(5, angle_step=1.1, z_step=1.3, **DETECTOR)),
+    "off centre": off_centre(circular(6, start=0.3, **DETECTOR)),
+    "fine pixels": circular(3, start=0.2, **DETECTOR | {"pixel_size": 0.4, "shape": (47, 41)}),
+    "coarse pixels": circular(5, start=0.2, **DETECTOR | {"pixel_size": 9.0, "shape": (5, 4)}),
+    "one row": circular(4, start=0.4, **DETECTOR | {"shape": (1, 19)}),
+    "one column": circular(4, start=0.4, **DETECTOR | {"shape": (15, 1)}),
+    "little tilt": perturbed(circular(6, **DETECTOR), 0.1),
+    "tilted": perturbed(helix(6, angle_step=1.1, z_step=1.3, **DETECTOR), 1.0),
     "from above": from_above(4),
 }
 geometries = pytest.mark.parametrize("geometry", GEOMETRIES.values(), ids=GEOMETRIES)

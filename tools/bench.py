@@ -2,8 +2,8 @@
 
 Software takes turns run by run, in one process with as many threads, so that what else the machine
 does meets all alike: compare the ratios. Each is run once to warm up; medians are given. G/s are
-1e9 voxels times views a second, whatever share of them a panel sees. The JSON file has the time of
-every run, and the processors' time, which a busy machine disturbs less.
+1e9 voxels times views a second, whatever share of them a detector sees. The JSON file has the time
+of every run, and the processors' time, which a busy machine disturbs less.
 """
 
 import argparse

@@ -91,15 +91,15 @@ class Bench:
 Maker = Callable[[Bench], Iterator[Case | Value]]
 
 
-def circle(size: int = 256, views: int = 60, panel: int = 384) -> tuple[Any, Any]:
+def circle(size: int = 256, views: int = 60, detector: int = 384) -> tuple[Any, Any]:
     """Geometry and grid of `size` cubed voxels, all of which every view sees."""
     voxel = 0.1 * 256 / size
     geometry = clra.circular(
         views,
         source_to_axis=100.0,
         source_to_detector=150.0,
-        pixel_size=0.15 * 384 / panel,
-        shape=(panel, panel),
+        pixel_size=0.15 * 384 / detector,
+        shape=(detector, detector),
     )
     return geometry, clra.VolumeGrid(shape=(size, size, size), voxel_size=voxel)
 
@@ -112,7 +112,7 @@ def paper_helix() -> tuple[Any, Any]:
 
 
 def tilted(geometry: Any) -> Any:
-    """Geometry whose panels are rolled by a degree, so that v is not parallel to the axis."""
+    """Geometry whose detectors are rolled by a degree, so that v is not parallel to the axis."""
     cos, sin = math.cos(math.radians(1)), math.sin(math.radians(1))
     return clra.ConeBeamGeometry(
         source=geometry.source,
@@ -163,7 +163,7 @@ def projectors(bench: Bench) -> Iterator[Case]:
 def helix(bench: Bench) -> Iterator[Case]:
     size = "paper's helix at QR: 120x120x312, 216 views of 128^2"
     geometry, grid = paper_helix()
-    # The square in the middle of every 16th panel.
+    # The square in the middle of every 16th detector.
     part = replace(geometry.subset(slice(None, None, 16)), shape=(128, 128))
     yield from _projecting(bench, part, grid, size)
 

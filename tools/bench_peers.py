@@ -101,7 +101,7 @@ class Rtk:
         return run
 
     def _geometry(self, geometry: ConeBeamGeometry) -> Any:
-        # Through its file, which knows any rectangular panel.
+        # Through its file, which knows any rectangular detector.
         with tempfile.NamedTemporaryFile(suffix=".xml") as file:
             write_rtk_geometry(file.name, geometry)
             reader = self._rtk.ThreeDCircularProjectionGeometryXMLFileReader.New()

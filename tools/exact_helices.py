@@ -41,7 +41,7 @@ HEAD = (
 
 
 def helix(pitch: float, views_a_turn: int) -> clra.ConeBeamGeometry:
-    """Return a helix that holds the grid, with a panel just tall enough."""
+    """Return a helix that holds the grid, with a detector just tall enough."""
     tangent = math.tan(math.asin(FIELD / SOURCE_TO_AXIS))
     pixel = 2 * SOURCE_TO_DETECTOR * tangent / COLUMNS
     slope = pitch / (2 * math.pi * SOURCE_TO_AXIS)

@@ -278,7 +278,7 @@ def overhead(columns: int, rows: int, views: int, rounds: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--columns", type=int, default=192, help="of the panel")
+    parser.add_argument("--columns", type=int, default=192, help="of the detector")
     parser.add_argument(
         "--length", type=float, default=0.95, help="of the sample, in grids' heights"
     )

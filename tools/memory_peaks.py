@@ -24,11 +24,11 @@ HEAD = (
 )
 
 
-def simulate(path: Path, views: int, panel: tuple[int, int]) -> None:
+def simulate(path: Path, views: int, detector: tuple[int, int]) -> None:
     from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
     from clra.io.scan_files import write_scan
 
-    geometry = paper_like("helix", views, panel)
+    geometry = paper_like("helix", views, detector)
     truth = simulated_motion("both", geometry, shift=(-3, 3), magnification=0.0, seed=0)
     write_scan(path, simulated_scan(geometry, sample("spheres", geometry), truth, name="peaks"))
 
@@ -151,7 +151,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=int, default=600)
     parser.add_argument(
-        "--panel", type=int, nargs=2, default=(320, 256), metavar=("ROWS", "COLUMNS")
+        "--detector", type=int, nargs=2, default=(320, 256), metavar=("ROWS", "COLUMNS")
     )
     parser.add_argument("--host-mib", type=int, default=64)
     parser.add_argument("--device-mib", type=int, default=32)
@@ -168,7 +168,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scan = folder / "scan.nxs"
-        simulate(scan, given.views, tuple(given.panel))
+        simulate(scan, given.views, tuple(given.detector))
         print(f"scan {scan.stat().st_size >> 20} MiB\n\n{HEAD}")
         for method in given.methods:
             free = measured(method, scan, folder, None, None)

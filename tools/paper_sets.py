@@ -23,21 +23,21 @@ VIEWS, VOXEL, SAMPLE = 3456, 0.004544, (1248, 480)  # planes and columns of the 
 SPHERES = three_spheres(SAMPLE[1] / 2 * VOXEL, SAMPLE[0] * VOXEL)
 MOTIONS = {"random": random_motion, "smooth": smooth_motion}
 SETS = [(t, m) for t in ("helix", "space-filling") for m in MOTIONS]
-SHIFT = -10.0, 8.0  # pixels, of whatever panel
+SHIFT = -10.0, 8.0  # pixels, of whatever detector
 
 
 def geometry_of(trajectory: str, scale: int) -> clra.ConeBeamGeometry:
     """Return the paper's trajectory with `scale` times larger pixels and as much fewer views."""
     rows, columns = PAPER["shape"]
-    panel = {
+    detector = {
         **PAPER,
         "shape": (rows // scale, columns // scale),
         "pixel_size": PAPER["pixel_size"] * scale,
         "z_step": PAPER["z_step"] * scale,
     }
     if trajectory == "helix":
-        return clra.helix(VIEWS // scale, angle_step=math.radians(0.5 * scale), **panel)
-    return clra.space_filling(VIEWS // scale, **panel)
+        return clra.helix(VIEWS // scale, angle_step=math.radians(0.5 * scale), **detector)
+    return clra.space_filling(VIEWS // scale, **detector)
 
 
 def surfaces(count: int = 1500) -> NDArray[np.float64]:

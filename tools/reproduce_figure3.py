@@ -3,7 +3,7 @@
 ``python tools/reproduce_figure3.py --scale 1 -o FOLDER`` is the paper's size (3456 radiographs, we
 take 928 x 512); ``--scale 4`` has a quarter of the views, rows and columns. Four scans, {helix,
 space-filling} x {random, smooth}, of a stack of three spheres in closed form, with motions of -10
-to 8 pixels of either panel, without what a movement of the sample would explain. FR, 1QR-1HR and
+to 8 pixels of either detector, without what a movement of the sample would explain. FR, 1QR-1HR and
 2QR-2HR run with the paper's estimator (shifts only) and with ours, beside our ``auto``. Each run is
 kept in FOLDER/runs.json as soon as it is done: started again, the tool goes on where it was
 stopped. ``--estimator`` and ``--schedules`` choose some; at full size leave 4FR to a GPU or a long

@@ -8,10 +8,10 @@ of
   pixels;
 - a Berea sandstone, DATA/rock/berea_200.npz: its 200^3 voxels, mirrored, fill the cylinder of the
   paper's phantom, as large as half a pixel seen at the axis, whatever the scale: grains of about 14
-  pixels. itk-rtk projects them (Joseph) from where source and panel really stood; at a quarter of
-  the size by 2 x 2 rays a pixel, whose transmissions are averaged. Alignment itself reconstructs
-  from at most half of the panel's resolution, with voxels four times as large. The motion is of -10
-  to 8 pixels over the scale;
+  pixels. itk-rtk projects them (Joseph) from where source and detector really stood; at a quarter
+  of the size by 2 x 2 rays a pixel, whose transmissions are averaged. Alignment itself reconstructs
+  from at most half of the detector's resolution, with voxels four times as large. The motion is of
+  -10 to 8 pixels over the scale;
 - the same with voxels and grains half as large: a quarter of the resolution loses them.
 
 The open beam has 10 000 photons a pixel; line integrals reach 2 and 2.7. Photons are counted as
@@ -94,7 +94,8 @@ def berea(grid: VolumeGrid) -> NDArray[np.bool_]:
 def split(geometry: clra.ConeBeamGeometry, motion: clra.Motion, parts: int) -> Any:
     """Return the geometry with the motion absorbed and each pixel cut in `parts` x `parts`.
 
-    All pixels are of one size, as RTK wants them: a magnification moves the panel along its rays.
+    All pixels are of one size, as RTK wants them: a magnification moves the detector along its
+    rays.
     """
     moved, farther = geometry.with_motion(motion), motion.magnification[:, None]
     return clra.ConeBeamGeometry(

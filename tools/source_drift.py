@@ -1,14 +1,14 @@
 """How much of a drift of the source a shift and a magnification explain, and how much is parallax.
 
 ``python tools/source_drift.py`` simulates a porous sample in the geometry of the paper's scan of
-wood (source to axis 2.8823 mm, to the panel 315.5 mm, fan 67 degrees), by closed form, from where
-the source really was; aligns it with ``estimate="shift+scale"`` and ``"source"``; and prints the
-residual of the re-projection (median over the views, in the band that is registered) as a Markdown
-table. "true" is the residual with the true geometry: the reconstruction's own, which hides the
-motion's. It is given for ramp-filtered back-projection and for the same corrected once by what its
-re-projections lack. Panels are square, or flat, where the cone is so low that ramp-filtered
-back-projection leaves little. In micrometres, a drift is that of the source if its pixels are those
-of the paper's panel.
+wood (source to axis 2.8823 mm, to the detector 315.5 mm, fan 67 degrees), by closed form, from
+where the source really was; aligns it with ``estimate="shift+scale"`` and ``"source"``; and
+prints the residual of the re-projection (median over the views, in the band that is registered)
+as a Markdown table. "true" is the residual with the true geometry: the reconstruction's own, which
+hides the motion's. It is given for ramp-filtered back-projection and for the same corrected once by
+what its re-projections lack. Detectors are square, or flat, where the cone is so low that
+ramp-filtered back-projection leaves little. In micrometres, a drift is that of the source if its
+pixels are those of the paper's detector.
 """
 
 import numpy as np
@@ -29,12 +29,12 @@ from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
-PANEL, SOURCE, DETECTOR = 422.56, 2.8823, 315.5  # mm
+DETECTOR, SOURCE, DETECTOR = 422.56, 2.8823, 315.5  # mm
 PAPER_PIXEL = 139.0  # um
 # Rows, columns, views, largest shift at the depth of the axis [pixel]
 CASES = [(160, 160, 360, 4.0), (160, 160, 360, 8.0), (80, 320, 600, 4.0), (80, 320, 600, 12.0)]
 HEAD = (
-    "| panel | drift [pixel] | [um] | left by ramp-FBP: true, shift+scale, source | ratio | "
+    "| detector | drift [pixel] | [um] | left by ramp-FBP: true, shift+scale, source | ratio | "
     "corrected: true, shift+scale, source | ratio | error of shift+scale, u, v | of source |\n"
     "|---|---|---|---|---|---|---|---|---|"
 )
@@ -42,10 +42,10 @@ HEAD = (
 
 def drifting(rows: int, columns: int, views: int, shift: float) -> clra.Scan:
     """Return a scan whose source drifts; its truth is the apparent motion."""
-    pixel = PANEL / columns
+    pixel = DETECTOR / columns
     height = 0.5 * rows * pixel * SOURCE / DETECTOR
-    panel = {"source_to_axis": SOURCE, "source_to_detector": DETECTOR, "pixel_size": pixel}
-    geometry = clra.space_filling(views, z_step=height / views, shape=(rows, columns), **panel)
+    detector = {"source_to_axis": SOURCE, "source_to_detector": DETECTOR, "pixel_size": pixel}
+    geometry = clra.space_filling(views, z_step=height / views, shape=(rows, columns), **detector)
     grid = default_grid(geometry)
     drift = smooth_motion(views, seed=2, shift=(-shift, shift), magnification=0.004)
     truth = without_gauge(drift, geometry, [sample_points(grid)]).caused_by("source")
@@ -80,7 +80,7 @@ def _left(
         scan.geometry.with_motion(motion),
         registration,
         magnification=motion.magnification,
-        panel=scan.geometry.shape,
+        detector=scan.geometry.shape,
     )
     return float(np.median(found.residual))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from clra.errors import InputError
 
 
-def panel(option: str, text: str) -> tuple[int, int]:
+def detector(option: str, text: str) -> tuple[int, int]:
     """Read "ROWSxCOLUMNS".
 
     Parameters

@@ -25,7 +25,7 @@ class Cost:
     ----------
     level : str
         "FR", "HR" or "QR".
-    panel : (int, int)
+    detector : (int, int)
         Rows and columns of a radiograph.
     radiograph_bytes, volume_bytes : int
         Size of all radiographs and of the volume.
@@ -42,7 +42,7 @@ class Cost:
     """
 
     level: str
-    panel: tuple[int, int]
+    detector: tuple[int, int]
     radiograph_bytes: int
     volume_shape: tuple[int, int, int]
     volume_bytes: int
@@ -81,7 +81,7 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
         costs.append(
             Cost(
                 level=level_name(level),
-                panel=(rows, columns),
+                detector=(rows, columns),
                 radiograph_bytes=4 * pixels,
                 volume_shape=(nz, ny, nx),
                 volume_bytes=4 * nz * ny * nx,
@@ -133,7 +133,7 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
         rows.append(
             (
                 cost.level,
-                f"{cost.panel[0]} x {cost.panel[1]}",
+                f"{cost.detector[0]} x {cost.detector[1]}",
                 size(cost.radiograph_bytes),
                 f"{nx} x {ny} x {nz}",
                 size(cost.volume_bytes),

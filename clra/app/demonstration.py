@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clra.progress import ProgressCallback
 
 # Chosen so that all of it ends within two minutes on two cores without a GPU.
-VIEWS, PANEL = 360, (256, 192)
+VIEWS, DETECTOR = 360, (256, 192)
 _SHIFT, _MAGNIFICATION, _PHOTONS = (-10.0, 10.0), 0.002, 20000.0
 
 
@@ -60,7 +60,7 @@ def run_demo(
     folder: Path | None = None,
     *,
     views: int = VIEWS,
-    panel: tuple[int, int] = PANEL,
+    detector: tuple[int, int] = DETECTOR,
     schedule: str = "auto",
     phantom: str = "porous",
     seed: int = 0,
@@ -75,7 +75,7 @@ def run_demo(
         For the files; a new temporary one if not given.
     views : int
         Number of radiographs.
-    panel : (int, int)
+    detector : (int, int)
         Rows and columns of a radiograph.
     schedule : str
         Of the alignment.
@@ -91,7 +91,7 @@ def run_demo(
     if folder is None:
         folder = Path(tempfile.mkdtemp(prefix="clra-demo-"))
     folder.mkdir(parents=True, exist_ok=True)
-    geometry = paper_like("space-filling", views, panel)
+    geometry = paper_like("space-filling", views, detector)
     truth = simulated_motion(
         "both", geometry, shift=_SHIFT, magnification=_MAGNIFICATION, seed=seed
     )

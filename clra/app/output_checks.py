@@ -53,7 +53,7 @@ def room_for(
 def motion_for(
     scan: Scan, path: str | os.PathLike[str], geometry: str
 ) -> tuple[Scan, Motion, NDArray[np.bool_]]:
-    """Read the motion of a scan, and take the panel as the alignment took it.
+    """Read the motion of a scan, and take the detector as the alignment took it.
 
     Parameters
     ----------
@@ -67,10 +67,10 @@ def motion_for(
     Returns
     -------
     scan : Scan
-        With the panel moved and turned as an auto-focus found it, if there was one.
+        With the detector moved and turned as an auto-focus found it, if there was one.
     motion : Motion
         Relative to that.
-    believed : ndarray of bool, (views,)
+    valid_views : ndarray of bool, (views,)
         Views that the alignment did not flag.
 
     Raises
@@ -81,11 +81,11 @@ def motion_for(
     """
     file = read_motion_file(path)
     _check(scan, file.motion, file.attributes, path, geometry)
-    believed = all_but(file.flagged, scan.views)
-    if not believed.any():
+    valid_views = all_but(file.flagged, scan.views)
+    if not valid_views.any():
         found = f"all {scan.views} views"
         raise InputError.at(path, "/motion/flagged", found, "at least one that is not flagged")
-    return focused(scan, file.attributes, path), file.motion, believed
+    return focused(scan, file.attributes, path), file.motion, valid_views
 
 
 def matched(scan: Scan, record: Record, path: str | os.PathLike[str], geometry: str) -> Scan:
@@ -100,22 +100,22 @@ def matched(scan: Scan, record: Record, path: str | os.PathLike[str], geometry: 
 def focus_attributes(focus: Focus) -> dict[str, str]:
     """Write down what an auto-focus found, for :func:`focused`."""
     return {
-        "panel_offset_u": f"{focus.offset_u:.6g} pixel",
-        "panel_tilt": f"{math.degrees(focus.tilt):.6g} degree",
-        "panel_sharpening": f"{focus.sharpening:.4g}",
+        "detector_offset_u": f"{focus.offset_u:.6g} pixel",
+        "detector_tilt": f"{math.degrees(focus.tilt):.6g} degree",
+        "detector_sharpening": f"{focus.sharpening:.4g}",
     }
 
 
 def focused(scan: Scan, attributes: Mapping[str, str], path: str | os.PathLike[str]) -> Scan:
-    """Take the panel of a scan as the attributes of a motion file say."""
-    if "panel_offset_u" not in attributes:
+    """Take the detector of a scan as the attributes of a motion file say."""
+    if "detector_offset_u" not in attributes:
         return scan
-    names = ("panel_offset_u", "panel_tilt", "panel_sharpening")
+    names = ("detector_offset_u", "detector_tilt", "detector_sharpening")
     try:
         offset, tilt, sharpening = (float(attributes[name].split()[0]) for name in names)
     except (KeyError, ValueError, IndexError):
         found = ", ".join(repr(attributes.get(name)) for name in names)
-        raise InputError.at(path, "/@panel", found, "a number in each of them") from None
+        raise InputError.at(path, "/@detector", found, "a number in each of them") from None
     return Focus(offset, math.radians(tilt), sharpening).applied(scan)
 
 

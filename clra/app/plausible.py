@@ -53,7 +53,7 @@ def warn_of_scale(scan: Scan) -> None:
 
 
 def doubt_of_turning(sharpening: float) -> str:
-    """Say so if slices are sharper with the sample turning the other way.
+    """Return a warning if slices are sharper with the sample turning the other way.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def doubt_of_turning(sharpening: float) -> str:
 
 
 def doubt_of_shifts(quality: "Quality", motion: Motion) -> str:
-    """Say so if half scans disagree on the shifts by more than there is of them.
+    """Return a warning if half scans disagree on the shifts by more than there is of them.
 
     Parameters
     ----------

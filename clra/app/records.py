@@ -29,9 +29,9 @@ class Record:
     motion : Motion
         As estimated.
     confidence : ndarray, (views,)
-        0 to 1; 0 for a view that is not believed. All 1 where a file does not tell.
+        0 to 1; 0 for a view that is rejected. All 1 where a file does not tell.
     flagged : tuple of int
-        Views that are not believed.
+        Views that are rejected.
     history : tuple of Iteration
         Of the run.
     gauge : mapping of str to float
@@ -53,7 +53,7 @@ class Record:
     about: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def believed(self) -> NDArray[np.bool_]:
+    def valid_views(self) -> NDArray[np.bool_]:
         """Views but for the flagged ones, (views,)."""
         return all_but(self.flagged, self.motion.views)
 
@@ -85,15 +85,15 @@ class Record:
         scan : Scan
             Three of its radiographs are read for a checksum.
         earlier : Record, optional
-            Of the run that it started from: its history comes first, and the panel is still where
-            an auto-focus found it then.
+            Of the run that it started from: its history comes first, and the detector is still
+            where an auto-focus found it then.
         **about : str
             What else is to be remembered.
         """
         u, v, m = np.median(result.sigma, axis=0).tolist()
         before = () if earlier is None else earlier.history
         known = {} if earlier is None else earlier.about
-        panel = {name: told for name, told in known.items() if name.startswith("panel_")}
+        detector = {name: told for name, told in known.items() if name.startswith("detector_")}
         return cls(
             motion=result.motion,
             confidence=result.confidence,
@@ -108,7 +108,7 @@ class Record:
                 "schedule": result.schedule,
                 "device": result.device,
                 **_source_travel(result.motion, scan),
-                **panel,
+                **detector,
                 **about,
             },
         )

@@ -17,7 +17,7 @@ from clra.io.motion_file import read_motion_file, write_motion_file
 from clra.io.scan_files import scan_checksum
 from clra.io.volumes.volume_files import open_volume, read_volume
 from clra.methods.alignment.reprojection import with_margin
-from clra.methods.reconstruction.imgr_state import Progressed, Step
+from clra.methods.reconstruction.imgr_state import ImgrState, Step
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.model.schedule import level_factor
@@ -25,7 +25,7 @@ from clra.ops.streaming.slab_projector import volume_from
 from clra.ops.streaming.stream import Stream
 
 
-class Leftover:
+class SavedState:
     """The folder beside a volume that holds what the finished levels gave.
 
     volume.h5 is the volume at the resolution of the last level, with its margin; motion.h5 the
@@ -53,7 +53,7 @@ class Leftover:
         geometry = fingerprint(scan.geometry.to_astra(), *masks)
         self._settings = json.dumps(settings | {"geometry": geometry}, sort_keys=True)
 
-    def save(self, progressed: Progressed) -> None:
+    def save(self, state: ImgrState) -> None:
         """Keep what the finished levels gave.
 
         Raises
@@ -61,30 +61,30 @@ class Leftover:
         OutputError
             If it cannot be written.
         """
-        assert progressed.volume is not None
+        assert state.volume is not None
         self.clear()
         try:
             self.folder.mkdir()
         except OSError as error:
             raise OutputError(f"cannot make the folder {self.folder}: {error.strerror}") from error
-        with open_volume(self.folder / "volume.h5", progressed.volume.grid) as target:
-            progressed.volume.write(target)
+        with open_volume(self.folder / "volume.h5", state.volume.grid) as target:
+            state.volume.write(target)
         # Last, so that it stands for the whole.
         write_motion_file(
             self.folder / "motion.h5",
-            progressed.motion,
-            confidence=np.where(progressed.weak, 0.0, 1.0),
-            history=progressed.history,
+            state.motion,
+            confidence=np.where(state.rejected, 0.0, 1.0),
+            history=state.history,
             scan=self._scan.name,
             checksum=scan_checksum(self._scan),
             attributes={
                 "settings": self._settings,
-                "steps": json.dumps([asdict(step) for step in progressed.steps]),
-                "ended": "yes" if progressed.ended else "no",
+                "steps": json.dumps([asdict(step) for step in state.steps]),
+                "ended": "yes" if state.ended else "no",
             },
         )
 
-    def load(self, stream: Stream, grid: VolumeGrid) -> Progressed:
+    def load(self, stream: Stream, grid: VolumeGrid) -> ImgrState:
         """Take up what the finished levels gave.
 
         Parameters
@@ -114,7 +114,7 @@ class Leftover:
         wide = wide.binned(level) if level > 1 else wide
         volume = volume_from(stream, wide, _Planes(self.folder / "volume.h5", wide))
         assert file.confidence is not None
-        return Progressed(
+        return ImgrState(
             volume,
             file.motion,
             file.confidence == 0,

@@ -120,7 +120,7 @@ class Facts:
     views, rows, columns : int
         Size of the data.
     pixel_mm : (float, float)
-        Along u and v, on the panel.
+        Along u and v, on the detector.
     source_to_axis_mm, source_to_detector_mm, magnification, fan_angle_deg : float
         Of the instrument.
     path : Path
@@ -201,7 +201,7 @@ class Facts:
         return {
             "scan": f"{self.name} ({self.kind})",
             "views": f"{self.views}",
-            "panel": f"{self.rows} rows x {self.columns} columns, pixel {pixel_u} x {pixel_v}",
+            "detector": f"{self.rows} rows x {self.columns} columns, pixel {pixel_u} x {pixel_v}",
             **(
                 {"beam": "parallel"}
                 if math.isclose(
@@ -232,7 +232,7 @@ def metric(millimetres: float) -> str:
 
 
 def views_flagged(views: Sequence[int]) -> str:
-    """Count and list views that are not believed; the motion file and --json have them all."""
+    """Count and list views that are rejected; the motion file and --json have them all."""
     return f"{len(views)} views flagged" + (f": {listed(views, 20)}" if views else "")
 
 

@@ -23,20 +23,20 @@ MOTIONS = ("none", "random", "smooth", "both")
 PHANTOMS = ("spheres", "porous", "wood")
 
 # The paper's simulation: 3456 views of (we take) 928 rows, 0.5 degree apart on the helix, travel
-# 5.671 mm. A smaller scan keeps the fan, the turns and the travel in heights of the panel.
+# 5.671 mm. A smaller scan keeps the fan, the turns and the travel in heights of the detector.
 _PAPER_VIEWS, _PAPER_HELIX_STEP = 3456, math.radians(0.5)
-# Radius of the sample as a part of the field of view's: shifted by 4 % of the panel's width it is
-# still not truncated.
+# Radius of the sample as a part of the field of view's: shifted by 4 % of the detector's width it
+# is still not truncated.
 _FILLED = 0.9
 # Seeds of the clouds of points whose gauge is taken out of a truth.
 _CLOUDS = (0, 1, 2)
 
 
 def paper_like(kind: str, views: int, shape: tuple[int, int]) -> ConeBeamGeometry:
-    """Return the paper's geometry scaled to a panel of another size.
+    """Return the paper's geometry scaled to a detector of another size.
 
     Fan angle and distances stay; the pixel grows as the columns get fewer. The travel along z
-    stays the same part of the panel's height, and the helix keeps its 4.8 turns.
+    stays the same part of the detector's height, and the helix keeps its 4.8 turns.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def paper_like(kind: str, views: int, shape: tuple[int, int]) -> ConeBeamGeometr
     views : int
         Number of radiographs; even for a double helix.
     shape : (int, int)
-        Rows and columns of the panel.
+        Rows and columns of the detector.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def _cylinder(geometry: ConeBeamGeometry) -> VolumeGrid:
     nz, _, nx = whole.shape
     across = round(_FILLED * nx)
     if np.ptp(geometry.source[:, 2]) == 0:
-        # No view looks past the end of a sample on a circle: the near side has to fit the panel.
+        # No view looks past the end of a sample on a circle: the near side has to fit the detector.
         radius = 0.5 * across * whole.voxel_size
         nz = int(_FILLED * nz * (1 - radius / float(np.min(geometry.source_to_axis))))
     return VolumeGrid(shape=(max(nz, 1), across, across), voxel_size=whole.voxel_size)

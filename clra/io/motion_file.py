@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 _UNITS = {"shift_u": "pixel", "shift_v": "pixel", "magnification": "1"}
 _MEANING = (
     "A feature that the ideal geometry puts at pixel q = (column, row) of the full-resolution "
-    "panel appears at c + magnification (q - c) + shift, c the panel's centre, shift = "
+    "detector appears at c + magnification (q - c) + shift, c the detector's centre, shift = "
     "(shift_u, shift_v): positive toward higher columns and higher rows. If the cause is 'source', "
-    "this holds at the depth of the rotation axis: the source moved, and the panel did not."
+    "this holds at the depth of the rotation axis: the source moved, and the detector did not."
 )
 
 _FLAGGED = (
-    "Views, counted from 0, whose registration is not believed: they have the motion that lies "
+    "Views, counted from 0, whose registration is rejected: they have the motion that lies "
     "between their neighbours', and are best left out of a reconstruction."
 )
 
@@ -44,7 +44,7 @@ class MotionFile:
     confidence : ndarray of float64, (views,), or None
         0 to 1.
     flagged : tuple of int
-        Views whose registration is not believed; where the file does not list them, those without
+        Views whose registration is rejected; where the file does not list them, those without
         any confidence.
     history : dict of str to ndarray
         The run, a column of one value an iteration each; empty where the file tells none.
@@ -83,7 +83,7 @@ def write_motion_file(
     confidence : array_like, (views,), optional
         0 to 1.
     flagged : sequence of int
-        Views whose registration is not believed, from 0.
+        Views whose registration is rejected, from 0.
     history : sequence of dataclass instances or mappings
         One an iteration, all with the same fields of numbers, text or None.
     schedule, device, scan, checksum : str
@@ -159,7 +159,7 @@ def read_motion_file(path: str | os.PathLike[str]) -> MotionFile:
                 )
         confidence = columns.pop("confidence", None)
         try:
-            motion = Motion(**columns, cause=text(file["motion"].attrs.get("cause", "panel")))
+            motion = Motion(**columns, cause=_cause(file["motion"]))
         except ValueError as error:
             raise InputError(f"{os.fspath(path)}: /motion: {error}") from error
         attributes = {name: text(value) for name, value in file.attrs.items()}
@@ -184,7 +184,7 @@ def _column(dataset: h5py.Dataset) -> Floats:
 
 
 def _flagged(file: h5py.File, views: int, confidence: Floats | None) -> tuple[int, ...]:
-    """Read which views are not believed."""
+    """Read which views are rejected."""
     dataset = find(file, "motion/flagged")
     if not isinstance(dataset, h5py.Dataset):
         return () if confidence is None else tuple(np.flatnonzero(confidence == 0).tolist())
@@ -217,3 +217,8 @@ def _read_history(file: h5py.File) -> dict[str, NDArray[Any]]:
         for name, c in columns.items()
         if isinstance(c, h5py.Dataset)
     }
+
+
+def _cause(group: h5py.Group) -> str:
+    """Cause of a motion; files of version 0.1.0 call the detector a panel."""
+    return text(group.attrs.get("cause", "detector")).replace("panel", "detector")

@@ -46,8 +46,8 @@ def read_scan(
     source_distance : float, optional
         From the source to the rotation axis [mm], in place of the file's.
     parallel : bool
-        The beam is parallel: a source so far away that rays end within 1/8000 of the panel's width
-        of where parallel ones would, and the detector at the axis.
+        The beam is parallel: a source so far away that rays end within 1/8000 of the detector's
+        width of where parallel ones would, and the detector at the axis.
     white : float, optional
         Counts of the open beam, in place of flat frames; 1 for radiographs that hold transmission.
 
@@ -80,7 +80,7 @@ def write_scan(
     path: str | os.PathLike[str],
     scan: Scan,
     *,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write a scan's line integrals as NXtomo; the file appears whole or not at all.
@@ -91,7 +91,7 @@ def write_scan(
         The file.
     scan : Scan
         Read some views at a time.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views to be used, at least one, all by default. The others are written as well, marked
         invalid: readers of NXtomo, :func:`read_scan` too, leave them out.
     progress : callable, optional
@@ -100,7 +100,7 @@ def write_scan(
     Raises
     ------
     InputError
-        If `believed` is not of these views, or none.
+        If `valid_views` is not of these views, or none.
     OutputError
         If the file cannot be written.
     """
@@ -113,7 +113,7 @@ def write_scan(
         name=scan.name,
         truth=scan.truth,
         mask=scan.mask,
-        believed=believed,
+        valid_views=valid_views,
         progress=progress,
     )
 

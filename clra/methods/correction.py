@@ -57,7 +57,7 @@ def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
         raise InputError(f"motion: found {motion.views} views, expected {scan.views}")
     if motion.cause == "source":
         warnings.warn(
-            "radiographs are resampled as if their panel had moved, but it was the source: they "
+            "radiographs are resampled as if their detector had moved, but it was the source: they "
             "are right for what lies at the depth of the axis, and what is nearer to the source or "
             "farther keeps its parallax",
             stacklevel=2,

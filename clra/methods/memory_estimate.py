@@ -109,7 +109,7 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     """
     geometry = full.binned(level) if level > 1 else full
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
-    # On small panels its re-projections are kept beside the radiographs.
+    # On small detectors its re-projections are kept beside the radiographs.
     count = int(level > 1) + int(Solver().is_biased(geometry.shape))
     return _registering_need(budgets, full, geometry, grid, 1, [_bytes(geometry)] * count)
 

@@ -1,4 +1,4 @@
-"""Samples that are wider than what the panel sees of them, as far as radiographs tell."""
+"""Samples that are wider than what the detector sees of them, as far as radiographs tell."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ def profiles(radiographs: Radiographs, views: slice, rows: slice) -> NDArray[np.
 
 
 def truncated(radiographs: Radiographs) -> str:
-    """Say so if the sample reaches beyond the left or right border of the panel.
+    """Return a warning if the sample reaches beyond the left or right border of the detector.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def truncated(radiographs: Radiographs) -> str:
     if not cut > AT_BORDER * most:
         return ""
     return (
-        f"the sample reaches beyond the panel (line integrals of {cut:.3g} in its outermost "
+        f"the sample reaches beyond the detector (line integrals of {cut:.3g} in its outermost "
         f"columns, {most:.3g} inside): intensities are too high, most towards the border of the "
         "field of view"
     )

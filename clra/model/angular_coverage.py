@@ -11,7 +11,8 @@ from clra.model.geometry import ConeBeamGeometry
 
 Floats = NDArray[np.float64]
 
-# Part of the panel's height, as seen at the axis, by which sources may rise and still be a circle.
+# Part of the detector's height, as seen at the axis, by which sources may rise and still be a
+# circle.
 _FLAT = 0.05
 # Views stand evenly if no two differ more than this in the angle that they stand for.
 _EVEN = 1.05
@@ -66,7 +67,7 @@ def covered(geometry: ConeBeamGeometry) -> float:
 
 
 def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
-    """Say so if ramp-filtered back-projection sees some rays of a circle twice and some once.
+    """Return a warning if redundant rays of a short scan are counted twice.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Pixels of a panel that may not be used, filled from those beside them."""
+"""Pixels of a detector that may not be used, filled from those beside them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Panels that stand otherwise than the geometry says, or than ramp filters expect."""
+"""Detectors that stand otherwise than the geometry says, or than ramp filters expect."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from clra.model.geometry import ConeBeamGeometry
 _STEEP = np.radians(10.0)
 
 
-def with_panel(
+def with_detector(
     geometry: ConeBeamGeometry, *, offset_u: float = 0.0, tilt: float = 0.0
 ) -> ConeBeamGeometry:
-    """Return the geometry with the panel shifted along its rows and turned in its plane.
+    """Return the geometry with the detector shifted along its rows and turned in its plane.
 
     A point that `geometry` puts at q, the returned one puts at ``c + R (q - c) + (offset_u, 0)``,
-    with c the panel's centre, q = (column, row), and R the rotation by `tilt`.
+    with c the detector's centre, q = (column, row), and R the rotation by `tilt`.
 
     Parameters
     ----------
     geometry : ConeBeamGeometry
-        As it was believed to be.
+        As it was thought to be.
     offset_u : float
-        Shift of the radiographs toward higher columns [pixel]: where the shadow of the axis lies.
+        Shift of the radiographs toward higher columns [pixel]: where the projection of the axis
+        lies.
     tilt : float
         Angle by which radiographs are turned from columns toward rows [rad]; pixels that are not
         square are turned as lengths.
@@ -43,7 +44,7 @@ def with_panel(
 
 
 def steep_rows(geometry: ConeBeamGeometry) -> str:
-    """Say so if the rows of a panel run so far up and down that filtering along them is wrong.
+    """Return a warning if detector rows are too steep to be filtered along.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def steep_rows(geometry: ConeBeamGeometry) -> str:
     if angle < _STEEP:
         return ""
     return (
-        f"fbp filters along the rows of the panel, which rise by {np.degrees(angle):.0f} degrees, "
-        f"expected less than {np.degrees(_STEEP):.0f}; intensities may be off by a third, not by "
-        "method 'osem-tr'"
+        f"fbp filters along the rows of the detector, which rise by {np.degrees(angle):.0f} "
+        f"degrees, expected less than {np.degrees(_STEEP):.0f}; intensities may be off by "
+        "a third, not by method 'osem-tr'"
     )

@@ -1,4 +1,4 @@
-"""The acquisition geometry: where source and panel stood in each view."""
+"""The acquisition geometry: where source and detector stood in each view."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
-from clra.model.validation import panel_shape, same_views, selection, vectors, whole
+from clra.model.validation import detector_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
     from clra.model.motion import Motion
 
 Floats = NDArray[np.float64]
 
-# Ratios of lengths below which a panel counts as degenerate: float64 rounding leaves 1e-16, and no
-# scanner has an angle of 1e-9 between its rows and columns.
+# Ratios of lengths below which a detector counts as degenerate: float64 rounding leaves 1e-16, and
+# no scanner has an angle of 1e-9 between its rows and columns.
 _DEGENERATE = 1e-9
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class ConeBeamGeometry:
-    """Source and panel of every view, in a right-handed frame fixed to the sample.
+    """Source and detector of every view, in a right-handed frame fixed to the sample.
 
     The z axis is the rotation axis. The centre of pixel (row j, column i) of a view is
     ``detector + (i - (columns - 1) / 2) u + (j - (rows - 1) / 2) v``; these are the numbers of
@@ -34,17 +34,17 @@ class ConeBeamGeometry:
     source : array_like, (views, 3)
         Position (x, y, z) of the source [mm].
     detector : array_like, (views, 3)
-        Position of the panel's centre [mm].
+        Position of the detector's centre [mm].
     u, v : array_like, (views, 3)
         Step from one column, and from one row, to the next [mm].
     shape : (int, int)
-        Rows and columns of the panel.
+        Rows and columns of the detector.
 
     Raises
     ------
     InputError
         If shapes disagree, a number is not finite, ``u`` and ``v`` are parallel, or the source
-        lies in the panel's plane.
+        lies in the detector's plane.
     """
 
     source: Floats
@@ -66,19 +66,21 @@ class ConeBeamGeometry:
         object.__setattr__(self, "detector", vectors("detector", detector, "views"))
         object.__setattr__(self, "u", vectors("u", u, "views"))
         object.__setattr__(self, "v", vectors("v", v, "views"))
-        object.__setattr__(self, "shape", panel_shape(shape))
+        object.__setattr__(self, "shape", detector_shape(shape))
         same_views(source=self.source, detector=self.detector, u=self.u, v=self.v)
         self._refuse_degenerate()
 
     def _refuse_degenerate(self) -> None:
-        """Raise where a panel is no plane or its source lies in it."""
+        """Raise where a detector is no plane or its source lies in it."""
         pitch_u, pitch_v = _norm(self.u), _norm(self.v)
         area = _norm(np.cross(self.u, self.v))
         _refuse(area <= _DEGENERATE * pitch_u * pitch_v, "u and v: parallel or zero", "a plane")
         ray = self.detector - self.source
         reach = _norm(ray) + self.columns * pitch_u + self.rows * pitch_v
         depth = np.abs(_dot(np.cross(self.u, self.v), ray)) / area
-        _refuse(depth <= _DEGENERATE * reach, "source: in the panel's plane", "one off the plane")
+        _refuse(
+            depth <= _DEGENERATE * reach, "source: in the detector's plane", "one off the plane"
+        )
 
     @property
     def views(self) -> int:
@@ -87,12 +89,12 @@ class ConeBeamGeometry:
 
     @property
     def rows(self) -> int:
-        """Rows of the panel."""
+        """Rows of the detector."""
         return self.shape[0]
 
     @property
     def columns(self) -> int:
-        """Columns of the panel."""
+        """Columns of the detector."""
         return self.shape[1]
 
     def __len__(self) -> int:
@@ -106,7 +108,7 @@ class ConeBeamGeometry:
         return self.shape == other.shape and np.array_equal(self.to_astra(), other.to_astra())
 
     def __repr__(self) -> str:
-        """Summarise views, panel, distances and travel."""
+        """Summarise views, detector, distances and travel."""
         z = self.source[:, 2]
         pixel = f"{np.median(_norm(self.u)):.4g} x {np.median(_norm(self.v)):.4g}"
         return (
@@ -123,14 +125,14 @@ class ConeBeamGeometry:
 
     @property
     def normal(self) -> Floats:
-        """Unit normal of the panel that points away from the source, (views, 3)."""
+        """Unit normal of the detector that points away from the source, (views, 3)."""
         normal = np.cross(self.u, self.v)
         away = np.sign(_dot(normal, self.detector - self.source))
         return np.asarray(normal * (away / _norm(normal))[:, None])
 
     @property
     def source_to_detector(self) -> Floats:
-        """Distance from the source to the panel's plane, (views,) [mm]."""
+        """Distance from the source to the detector's plane, (views,) [mm]."""
         return _dot(self.normal, self.detector - self.source)
 
     @property
@@ -147,20 +149,20 @@ class ConeBeamGeometry:
 
     @property
     def _centre(self) -> Floats:
-        """(column, row) of the panel's centre."""
+        """(column, row) of the detector's centre."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
     def with_motion(self, motion: Motion) -> ConeBeamGeometry:
         """Absorb the motion of each view, so that no radiograph is resampled.
 
         A point that this geometry puts at pixel q, the returned one puts at
-        ``c + magnification (q - c) + shift``, with c the panel's centre and q = (column, row); for
-        a motion of the source, only if the point lies at the depth of the axis.
+        ``c + magnification (q - c) + shift``, with c the detector's centre and q = (column, row);
+        for a motion of the source, only if the point lies at the depth of the axis.
 
         Parameters
         ----------
         motion : Motion
-            Shifts in pixels of this geometry's panel: absorb first, bin after.
+            Shifts in pixels of this geometry's detector: absorb first, bin after.
 
         Returns
         -------
@@ -194,21 +196,22 @@ class ConeBeamGeometry:
         Parameters
         ----------
         motion : Motion
-            Apparent motion of what lies at the depth of the axis, in pixels of this panel.
+            Apparent motion of what lies at the depth of the axis, in pixels of this detector.
 
         Returns
         -------
         ndarray, (views, 3)
-            Displacement (x, y, z) of the source, the panel standing still [mm]: along the panel
-            ``-shift pitch / (M' - 1)`` with the shift that is left when the magnification is taken
-            about the principal point, and toward it until SDD / SOD has become M' = m SDD / SOD.
+            Displacement (x, y, z) of the source, the detector standing still [mm]: along the
+            detector ``-shift pitch / (M' - 1)`` with the shift that is left when the magnification
+            is taken about the principal point, and toward it until SDD / SOD has become M' = m SDD
+            / SOD.
         """
-        to_axis, to_panel = self.source_to_axis, self.source_to_detector
-        magnified = motion.magnification * to_panel / to_axis
+        to_axis, to_detector = self.source_to_axis, self.source_to_detector
+        magnified = motion.magnification * to_detector / to_axis
         lateral = np.stack([motion.shift_u, motion.shift_v], axis=1)
         lateral -= (1 - motion.magnification)[:, None] * (self.principal - self._centre)
         lateral /= (1 - magnified)[:, None]
-        toward = (magnified * to_axis - to_panel) / (magnified - 1)
+        toward = (magnified * to_axis - to_detector) / (magnified - 1)
         return np.asarray(
             lateral[:, :1] * self.u + lateral[:, 1:] * self.v + toward[:, None] * self.normal
         )
@@ -216,8 +219,8 @@ class ConeBeamGeometry:
     def binned(self, factor: int = 2) -> ConeBeamGeometry:
         """Return the geometry of radiographs averaged over blocks of pixels.
 
-        The last rows and columns that fill no whole block are dropped and the centre of the panel
-        moves with them, so that every pixel stays where it was.
+        The last rows and columns that fill no whole block are dropped and the centre of the
+        detector moves with them, so that every pixel stays where it was.
 
         Parameters
         ----------
@@ -227,7 +230,7 @@ class ConeBeamGeometry:
         Raises
         ------
         InputError
-            If it is less than 1 or more than the panel has.
+            If it is less than 1 or more than the detector has.
         """
         factor = whole("factor", factor)
         rows, columns = self.rows // factor, self.columns // factor
@@ -269,7 +272,7 @@ class ConeBeamGeometry:
         -------
         ndarray, (views, 3, 4)
             P with (a, b, g) = P (x, y, z, 1): column = a / g and row = b / g, 0-based. g is the
-            depth of the point as a fraction of the panel's: 0 at the source, 1 on the panel.
+            depth of the point as a fraction of the detector's: 0 at the source, 1 on the detector.
         """
         rotation = self._to_pixels()
         return np.concatenate([rotation, -rotation @ self.source[:, :, None]], axis=2)
@@ -321,7 +324,7 @@ class ConeBeamGeometry:
         vectors : array_like, (views, 12)
             Source, detector, u and v of each view [mm].
         shape : (int, int)
-            Rows and columns of the panel.
+            Rows and columns of the detector.
 
         Raises
         ------

@@ -136,8 +136,8 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
 
     A voxel is a pixel seen at the axis, |u| SOD / SDD (median over the views). In x and y the grid
     covers the circle about the axis that every view sees: its radius is the distance from the axis
-    to the nearer of the planes through the source and a side of the panel, SOD sin(half fan). In z
-    it covers the heights at which the axis is seen by at least half as many views as where it is
+    to the nearer of the planes through the source and a side of the detector, SOD sin(half fan). In
+    z it covers the heights at which the axis is seen by at least half as many views as where it is
     seen best.
 
     Parameters

@@ -13,7 +13,7 @@ from clra.model.validation import column, same_views, selection, whole
 
 Floats = NDArray[np.float64]
 
-CAUSES = ("panel", "source")
+CAUSES = ("detector", "source")
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -21,17 +21,17 @@ class Motion:
     """Shift and magnification of each view.
 
     A feature that the ideal geometry puts at pixel q appears at
-    ``c + magnification (q - c) + shift``, c the panel's centre, q and shift ordered (u, v).
+    ``c + magnification (q - c) + shift``, c the detector's centre, q and shift ordered (u, v).
 
     Parameters
     ----------
     shift_u : array_like, (views,)
-        Shift toward higher columns [pixel of the full-resolution panel].
+        Shift toward higher columns [pixel of the full-resolution detector].
     shift_v : array_like, (views,)
-        Shift toward higher rows [pixel of the full-resolution panel].
+        Shift toward higher rows [pixel of the full-resolution detector].
     magnification : array_like, (views,), optional
         Above 1 where the radiograph appears larger; all 1 if not given.
-    cause : {"panel", "source"}
+    cause : {"detector", "source"}
         What moved: the radiograph in its plane, or the source. A source that moves shifts what is
         near it farther than what is far; the numbers above are then those of a point at the depth
         of the rotation axis.
@@ -54,7 +54,7 @@ class Motion:
         shift_u: ArrayLike,
         shift_v: ArrayLike,
         magnification: ArrayLike | None = None,
-        cause: str = "panel",
+        cause: str = "detector",
     ) -> None:
         if cause not in CAUSES:
             raise InputError(f"cause: found {cause!r}, expected one of {CAUSES}")
@@ -71,7 +71,7 @@ class Motion:
             )
 
     @classmethod
-    def identity(cls, views: int, cause: str = "panel") -> Motion:
+    def identity(cls, views: int, cause: str = "detector") -> Motion:
         """Return no motion of `views` views."""
         still = np.zeros(whole("views", views))
         return cls(shift_u=still, shift_v=still, cause=cause)
@@ -146,24 +146,24 @@ class Motion:
             cause=self.cause,
         )
 
-    def about(self, aside_u: float, aside_v: float) -> Motion:
-        """Return the same motion with magnifications about another point than the panel's centre.
+    def about(self, offset_u: float, offset_v: float) -> Motion:
+        """Return the same motion with magnifications about another centre.
 
         Parameters
         ----------
-        aside_u, aside_v : float
+        offset_u, offset_v : float
             From the centre so far to that point [pixel].
         """
         grown = self.magnification - 1
         return Motion(
-            shift_u=self.shift_u + grown * aside_u,
-            shift_v=self.shift_v + grown * aside_v,
+            shift_u=self.shift_u + grown * offset_u,
+            shift_v=self.shift_v + grown * offset_v,
             magnification=self.magnification,
             cause=self.cause,
         )
 
     def caused_by(self, cause: str) -> Motion:
-        """Return the same apparent motion, of the panel or of the source."""
+        """Return the same apparent motion, of the detector or of the source."""
         return Motion(
             shift_u=self.shift_u,
             shift_v=self.shift_v,

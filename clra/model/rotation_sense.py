@@ -7,11 +7,11 @@ import numpy as np
 from clra.model.geometry import ConeBeamGeometry
 
 
-def turned_back(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
+def opposite_rotation(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
     """Return the geometry of the same scanner with a sample that turns in the other sense.
 
     A view that stands at angle b is turned by -2b about z, and all that the scanner did in it with
-    it: heights, offsets and tilts of the panel stay.
+    it: heights, offsets and tilts of the detector stay.
 
     Parameters
     ----------

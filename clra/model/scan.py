@@ -48,7 +48,7 @@ class Scan:
         Anything with ``shape`` whose slices along the first axis are arrays: numpy, a memory map,
         an HDF5 dataset.
     geometry : ConeBeamGeometry
-        Of the same views and panel.
+        Of the same views and detector.
     kind : {"line-integrals", "transmission"}
         What the pixels are: -log(I / I0), or I / I0.
     name : str
@@ -56,7 +56,7 @@ class Scan:
     truth : Motion, optional
         The motion that a simulation put in.
     mask : array_like of bool, (rows, columns), optional
-        True where the panel's pixels may be used. What the others hold is never used, be it NaN:
+        True where the detector's pixels may be used. What the others hold is never used, be it NaN:
         they are filled from beside.
 
     Raises
@@ -177,8 +177,8 @@ class Scan:
         return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
     @property
-    def window_aside(self) -> tuple[float, float]:
-        """(columns, rows) by which the middle of `window` lies off that of the panel."""
+    def window_offset(self) -> tuple[float, float]:
+        """(columns, rows) by which the middle of `window` lies off that of the detector."""
         rows, columns = self.window
         total_rows, total_columns = self.geometry.shape
         return (
@@ -189,17 +189,19 @@ class Scan:
     def cropped(self) -> Scan:
         """Return the scan without the rows and columns in which no pixel may be used.
 
-        A panel's shadowed sides would be taken for the sample's. Magnifications are about the
+        A detector's shadowed sides would be taken for the sample's. Magnifications are about the
         middle of what is left: see :meth:`Motion.about`.
         """
         rows, columns = self.window
         shape = (rows.stop - rows.start, columns.stop - columns.start)
         if shape == self.geometry.shape:
             return self
-        aside_u, aside_v = self.window_aside
+        offset_u, offset_v = self.window_offset
         geometry = ConeBeamGeometry(
             source=self.geometry.source,
-            detector=self.geometry.detector + aside_u * self.geometry.u + aside_v * self.geometry.v,
+            detector=self.geometry.detector
+            + offset_u * self.geometry.u
+            + offset_v * self.geometry.v,
             u=self.geometry.u,
             v=self.geometry.v,
             shape=shape,
@@ -211,7 +213,7 @@ class Scan:
             geometry,
             self.kind,
             name=self.name,
-            truth=None if self.truth is None else self.truth.about(aside_u, aside_v),
+            truth=None if self.truth is None else self.truth.about(offset_u, offset_v),
             mask=None if mask.all() else mask,
         )
 

@@ -18,7 +18,7 @@ _EXPECTED = (
     "full (FR), half (HR), quarter (QR) or eighth (ER) resolution, joined by '-'"
 )
 
-# "auto" begins at an eighth of the resolution where the panel's shorter side keeps this many
+# "auto" begins at an eighth of the resolution where the detector's shorter side keeps this many
 # pixels. A fixed number of iterations does: they cost next to nothing there, and slow modes
 # (magnification and v that drift together along the scan) need them. By the paper's count, an
 # eighth 1/64 and a quarter 1/16 of an iteration, two more at the one and one at the other for what
@@ -31,8 +31,8 @@ _LARGE = (8, 6), (4, 3)
 # or three.
 _LIMIT, _LIMIT_AT_HALF = 20, 3
 
-# Median and largest shift update that count as converged [pixel of the full-resolution panel]: the
-# paper's best results are 0.25 pixel from the truth, so a tenth more changes nothing visible.
+# Median and largest shift update that count as converged [pixel of the full-resolution detector]:
+# the paper's best results are 0.25 pixel from the truth, so a tenth more changes nothing visible.
 _MEDIAN, _LARGEST = 0.1, 0.5
 # The median for "auto", at a quarter and at half of the resolution: slow modes go on for long at a
 # few hundredths of a pixel an iteration. At a quarter iterations cost little, and a real scan of
@@ -117,10 +117,10 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
     ----------
     text : str
         Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto":
-        "6ER-3QR" for large panels, for others quarter resolution until converged (at most 20
+        "6ER-3QR" for large detectors, for others quarter resolution until converged (at most 20
         iterations), then half until converged (at most 3).
     shape : (int, int)
-        Rows and columns of the panel, for "auto": large is from 384 on.
+        Rows and columns of the detector, for "auto": large is from 384 on.
 
     Returns
     -------
@@ -152,7 +152,8 @@ def update_size(update_u: ArrayLike, update_v: ArrayLike) -> tuple[float, float]
     Parameters
     ----------
     update_u, update_v : array_like, (views,)
-        Changes of the shifts in an iteration, signed or not [pixel of the full-resolution panel].
+        Changes of the shifts in an iteration, signed or not [pixel of the full-resolution
+        detector].
     """
     size = np.abs(np.stack([np.ravel(update_u), np.ravel(update_v)]))
     return float(np.median(size, axis=1).max()), float(np.max(size))
@@ -170,7 +171,7 @@ def converged(
     ----------
     update_u, update_v : array_like, (views,)
         Changes of the shifts in the last iteration, signed or not [pixel of the full-resolution
-        panel].
+        detector].
     previous_median : float, optional
         The median, as of `update_size`, of the iteration before at this resolution.
     tolerance : float

@@ -26,8 +26,8 @@ PAPER: Mapping[str, Any] = MappingProxyType(
     }
 )
 """The simulations of the paper, section 2: ``space_filling(3456, **PAPER)`` and
-``helix(3456, angle_step=math.radians(0.5), **PAPER)``. The panel's shape is not in the paper; this
-one sees the phantom's whole width."""
+``helix(3456, angle_step=math.radians(0.5), **PAPER)``. The detector's shape is not in the paper;
+this one sees the phantom's whole width."""
 
 # The angle of the paper's space-filling trajectory, "about 15.3 degrees".
 _NEAR = math.radians(15.3)
@@ -55,9 +55,9 @@ def circular(
     source_to_axis, source_to_detector : float
         Distances [mm].
     pixel_size : float
-        Edge of a pixel of the panel itself, not scaled to the axis [mm].
+        Edge of a pixel of the detector itself, not scaled to the axis [mm].
     shape : (int, int)
-        Rows and columns of the panel.
+        Rows and columns of the detector.
     start, arc : float
         First angle and angle covered [rad].
 

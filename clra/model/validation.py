@@ -41,7 +41,7 @@ def positive(name: str, value: Any) -> float:
     return number
 
 
-def panel_shape(shape: Any) -> tuple[int, int]:
+def detector_shape(shape: Any) -> tuple[int, int]:
     """Check (rows, columns)."""
     try:
         rows, columns = shape
@@ -84,15 +84,15 @@ def column(name: str, value: ArrayLike, each: str) -> Floats:
     return _finite_array(name, array, each)
 
 
-def believed_views(believed: ArrayLike, views: int) -> NDArray[np.bool_]:
-    """Check which views are believed: one value each, at least one of them true.
+def believed_views(valid_views: ArrayLike, views: int) -> NDArray[np.bool_]:
+    """Check which views are valid_views: one value each, at least one of them true.
 
     Only bool will do: as an index, numbers would choose views 0 and 1.
     """
-    array = np.asarray(believed)
+    array = np.asarray(valid_views)
     if array.dtype != np.bool_ or array.shape != (views,) or not array.any():
         raise InputError(
-            f"believed: found {array.shape} of {array.dtype}, {array.sum()} in all, "
+            f"valid_views: found {array.shape} of {array.dtype}, {array.sum()} in all, "
             f"expected ({views},) of bool with one or more"
         )
     return array

@@ -26,14 +26,14 @@ class Match:
     distance : ndarray, (n,)
         Root mean square distance, over the points, of where the two see a point [pixel]; infinite
         where one of them does not see it.
-    aside_u, aside_v : ndarray, (n,)
+    offset_u, offset_v : ndarray, (n,)
         Mean of where this scan's view sees the points less where the other's does [pixel].
     """
 
     views: NDArray[np.intp]
     distance: Floats
-    aside_u: Floats
-    aside_v: Floats
+    offset_u: Floats
+    offset_v: Floats
 
 
 def match_views(geometry: ConeBeamGeometry, other: ConeBeamGeometry, points: ArrayLike) -> Match:
@@ -42,7 +42,7 @@ def match_views(geometry: ConeBeamGeometry, other: ConeBeamGeometry, points: Arr
     Parameters
     ----------
     geometry, other : ConeBeamGeometry
-        Of the two scans, of panels alike.
+        Of the two scans, of detectors alike.
     points : array_like, (n, 3)
         Points of the sample [mm]; a few dozen will do.
 
@@ -53,11 +53,11 @@ def match_views(geometry: ConeBeamGeometry, other: ConeBeamGeometry, points: Arr
     Raises
     ------
     InputError
-        If the panels differ in rows or columns.
+        If the detectors differ in rows or columns.
     """
     if geometry.shape != other.shape:
         raise InputError(
-            f"panel: found {other.rows} x {other.columns} pixels, expected {geometry.rows} x "
+            f"detector: found {other.rows} x {other.columns} pixels, expected {geometry.rows} x "
             f"{geometry.columns} as in the scan"
         )
     points = vectors("points", points, "points")

@@ -10,7 +10,7 @@ from clra.model.grid import VolumeGrid
 
 
 def views_that_see(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.bool_]:
-    """Whether each view's panel can see any of a grid.
+    """Whether each view's detector can see any of a grid.
 
     Parameters
     ----------
@@ -22,12 +22,14 @@ def views_that_see(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.b
     Returns
     -------
     ndarray of bool, (views,)
-        False only where the shadow of the grid's bounding box misses the panel.
+        False only where the projection of the grid's bounding box misses the detector.
     """
     ends = [(axis[0] - h, axis[-1] + h) for axis in grid.coordinates() for h in [grid.voxel_size]]
     corners = np.array([(x, y, z) for x in ends[0] for y in ends[1] for z in ends[2]])
     pixels = geometry.project(corners)
-    behind = np.isnan(pixels).any(axis=(1, 2))  # a corner behind the source: its shadow has no end
+    behind = np.isnan(pixels).any(
+        axis=(1, 2)
+    )  # a corner behind the source: its projection has no end
     low = np.nanmin(pixels, axis=1, initial=np.inf)
     high = np.nanmax(pixels, axis=1, initial=-np.inf)
     size = np.array([geometry.columns, geometry.rows])

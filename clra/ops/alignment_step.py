@@ -32,7 +32,7 @@ class AlignmentStep:
 
     It is the paper's iteration for somebody who keeps radiographs and volume on the device and
     writes the loop; :func:`clra.align` cuts both to fit the memory, goes through resolutions, takes
-    off the bias of small panels, and deals with outliers and with the gauge.
+    off the bias of small detectors, and deals with outliers and with the gauge.
 
     Parameters
     ----------
@@ -127,12 +127,12 @@ class AlignmentStep:
         self._last: list[cl.Event] = []
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors for the same views and panel: the next motion.
+        """Take other vectors for the same views and detector: the next motion.
 
         Raises
         ------
         InputError
-            If views or panel differ, or the grid reaches behind a source.
+            If views or detector differ, or the grid reaches behind a source.
         """
         # The projectors first: only they may refuse the grid, and then nothing has changed.
         for operation in (self._back, self._forward, self._ramp, self._coverage):

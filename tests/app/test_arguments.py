@@ -2,11 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from clra.app.arguments import interval, panel, pixel, volume_file
+from clra.app.arguments import detector, interval, pixel, volume_file
 
 
 def test_values_are_read():
-    assert panel("--panel", "256x192") == (256, 192)
+    assert detector("--detector", "256x192") == (256, 192)
     assert interval("--shift", "-10,8") == (-10.0, 8.0)
     assert pixel("0.139") == 0.139
     assert pixel("0.139,0.14") == (0.139, 0.14)
@@ -16,8 +16,8 @@ def test_values_are_read():
 @pytest.mark.parametrize(
     ("read", "text"),
     [
-        (lambda t: panel("--panel", t), "256"),
-        (lambda t: panel("--panel", t), "0x4"),
+        (lambda t: detector("--detector", t), "256"),
+        (lambda t: detector("--detector", t), "0x4"),
         (lambda t: interval("--shift", t), "8,-10"),
         (lambda t: interval("--shift", t), "1,2,3"),
         (lambda t: interval("--shift", t), "nan,1"),

@@ -21,7 +21,7 @@ from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import read_volume
 from clra.methods.alignment.autofocus import Focus
 from clra.methods.alignment.result import AlignmentInterrupted
-from clra.model.detector_pose import with_panel
+from clra.model.detector_pose import with_detector
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -137,16 +137,16 @@ def test_bad_input_is_refused_before_work(clra, scan_file, motion_file, tmp_path
 def test_simulate_writes_a_scan_that_knows_its_motion(clra, tmp_path):
     out = tmp_path / "s.nxs"
     options = ["--trajectory", "helix", "--motion", "smooth", "--shift", "-3,2", "--views", 13]
-    code, text, _ = clra("simulate", out, *options, "--panel", "21x17", "--noise", 500, "--json")
+    code, text, _ = clra("simulate", out, *options, "--detector", "21x17", "--noise", 500, "--json")
     told = json.loads(text)
     assert code == 0 and told["views"] == 13 and told["largest_shift"] < 5
     scan = read_scan(out)
     assert scan.shape == (13, 21, 17)
     assert scan.truth is not None
     assert np.abs(scan.truth.shift_u).max() == pytest.approx(told["largest_shift"], abs=2)
-    code, text, err = clra("simulate", out, "--views", 4, "--panel", "9x9", "--quiet")
+    code, text, err = clra("simulate", out, "--views", 4, "--detector", "9x9", "--quiet")
     assert (code, text, err) == (0, "", "")
-    refused(clra("simulate", out, "--panel", "9"), 2, "--panel", "'9'")
+    refused(clra("simulate", out, "--detector", "9"), 2, "--detector", "'9'")
     refused(clra("simulate", out, "--trajectory", "spiral"), 2, "spiral", "helix")
     assert read_scan(out).views == 4  # what stood there before stands there still
 
@@ -199,7 +199,7 @@ def test_align_to_a_reference_scan(clra, scan, scan_file, tmp_path):
 
 
 def test_an_auto_focus_goes_with_the_motion(clra, monkeypatch, scan_file, tmp_path):
-    geometry = with_panel(read_scan(scan_file).geometry, offset_u=2.0, tilt=0.01)
+    geometry = with_detector(read_scan(scan_file).geometry, offset_u=2.0, tilt=0.01)
     monkeypatch.setattr(
         "clra.methods.alignment.autofocus.autofocus", lambda *_, **__: Focus(2.0, 0.01, 1.25)
     )
@@ -212,8 +212,8 @@ def test_an_auto_focus_goes_with_the_motion(clra, monkeypatch, scan_file, tmp_pa
         read_scan(fixed).geometry.u, geometry.u, atol=1e-6 * np.abs(geometry.u).max()
     )
     with h5py.File(motion, "r+") as file:
-        file.attrs["panel_tilt"] = "much"
-    refused(clra("correct", scan_file, "--motion", motion, "-o", fixed), 2, "@panel", "much")
+        file.attrs["detector_tilt"] = "much"
+    refused(clra("correct", scan_file, "--motion", motion, "-o", fixed), 2, "@detector", "much")
 
 
 def test_align_reconstruct_correct_report(clra, scan_file, tmp_path):
@@ -256,7 +256,7 @@ def test_alignment_goes_on_from_a_motion(clra, monkeypatch, scan_file, tmp_path)
     assert code == 0, err
     begun, ended = Record.load(first), Record.load(last)
     assert ended.history[:2] == begun.history and len(json.loads(out)["history"]) == 3
-    assert ended.about["panel_tilt"] == begun.about["panel_tilt"] == "0.572958 degree"
+    assert ended.about["detector_tilt"] == begun.about["detector_tilt"] == "0.572958 degree"
     assert ended.about["command"].endswith(f"--start {first}")
     # It begins where the other ended: were it at no motion, it would move by most of it again.
     moved = np.abs(ended.motion.shift_v - begun.motion.shift_v).mean()
@@ -367,7 +367,7 @@ def test_the_motion_of_another_scan_is_warned_of(clra, record, scan_file, tmp_pa
 
 
 def test_demo_shows_that_it_works(clra, monkeypatch, tmp_path):
-    small = partial(demonstration.run_demo, views=120, panel=(96, 72))
+    small = partial(demonstration.run_demo, views=120, detector=(96, 72))
     monkeypatch.setattr("clra.app.demonstration.run_demo", small)
     code, out, err = clra("demo", "--output", tmp_path / "d", "--json")
     assert code == 0, err

@@ -20,7 +20,7 @@ def test_costs_follow_from_shapes():
     assert (full.level, half.level, quarter.level) == ("FR", "HR", "QR")
     assert full.radiograph_bytes == 4 * 100 * 64 * 48
     assert full.volume_shape == default_grid(geometry).shape
-    assert quarter.panel == (16, 12)
+    assert quarter.detector == (16, 12)
     assert half.radiograph_bytes == full.radiograph_bytes / 4
     # on a circle the axis is seen from everywhere
     voxels = np.prod(full.volume_shape)
@@ -35,7 +35,7 @@ def test_a_long_scan_sees_a_voxel_in_part_of_its_views():
     geometry = paper_like("helix", 400, (64, 48))
     full = costs_of(geometry, SPEED)[0]
     part = full.voxel_views / np.prod(full.volume_shape) / 400
-    assert 0.5 < part < 0.8  # the panel is 0.74 of the travel high
+    assert 0.5 < part < 0.8  # the detector is 0.74 of the travel high
 
 
 def test_levels_stop_before_nothing_is_left():
@@ -83,7 +83,7 @@ def test_the_papers_double_helix():
     geometry, small = _wood(1), _wood(16)
     speed = measure(geometry, max_host_memory=8 << 30)
     full = costs_of(geometry, speed)[0]
-    assert geometry.views == 14136 and full.panel == (3040, 3040)
+    assert geometry.views == 14136 and full.detector == (3040, 3040)
     assert full.volume_shape == (5240, 2526, 2526)
     assert full.radiograph_bytes == 4 * 14136 * 3040**2
     for need in (full.reconstruction, full.iteration, full.exact):

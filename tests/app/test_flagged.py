@@ -62,8 +62,8 @@ def test_flagged_views_and_the_unobservable_are_told_and_kept(clra, bad_file, tm
     assert told["unobservable"].endswith("taken out")
     # Raw errors over all views, as printed, from the files themselves.
     truth = read_scan(bad_file).truth
-    believed = np.delete(np.arange(VIEWS), [BLANK, SATURATED])
-    for name, views in (("error", slice(None)), ("not flagged", believed)):
+    valid_views = np.delete(np.arange(VIEWS), [BLANK, SATURATED])
+    for name, views in (("error", slice(None)), ("not flagged", valid_views)):
         u = np.abs(found["shift_u"] - truth.shift_u)[views].mean()
         m = np.abs(found["magnification"] - truth.magnification)[views].mean()
         assert told[name].startswith(f"mean {u:.3f}, ")
@@ -125,15 +125,15 @@ def test_flagged_views_are_marked_invalid_where_radiographs_are_corrected(clra, 
         assert (np.delete(keys, [BLANK, SATURATED]) == 0).all()
     # What is read back is the views that are left, as they would have been without motion.
     corrected = read_scan(out)
-    believed = np.delete(np.arange(VIEWS), [BLANK, SATURATED])
-    geometry = measured.geometry.subset(believed)
+    valid_views = np.delete(np.arange(VIEWS), [BLANK, SATURATED])
+    geometry = measured.geometry.subset(valid_views)
     vectors = geometry.to_astra()
     vectors[:, 9:] *= -1  # rows run down in a file
     assert np.allclose(corrected.geometry.to_astra(), vectors, rtol=0, atol=1e-9)
     ideal = sample("porous", measured.geometry).line_integrals(geometry)
     error, before = (
         np.sqrt(np.mean((images - ideal)[:, 6:-6, 6:-6] ** 2, axis=(1, 2)))
-        for images in (corrected.read(0, 58)[:, ::-1], measured.read(0, 60)[believed])
+        for images in (corrected.read(0, 58)[:, ::-1], measured.read(0, 60)[valid_views])
     )
     assert (error < 0.02 * ideal.max()).all() and np.median(error / before) < 0.2
 

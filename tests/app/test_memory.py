@@ -24,8 +24,8 @@ main()
 """
 
 
-def _scan(path, views, panel):
-    geometry = paper_like("helix", views, panel)
+def _scan(path, views, detector):
+    geometry = paper_like("helix", views, detector)
     truth = Motion.identity(views)
     write_scan(path, simulated_scan(geometry, sample("spheres", geometry), truth, name=path.name))
     return path

@@ -46,7 +46,7 @@ def test_debug_adds_a_traceback_on_either_side_of_the_command():
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_with_130_and_leaves_no_file(sent, tmp_path):
     process = subprocess.Popen(
-        [*CLRA, "simulate", str(tmp_path / "s.nxs"), "--views", "3456", "--panel", "928x512"],
+        [*CLRA, "simulate", str(tmp_path / "s.nxs"), "--views", "3456", "--detector", "928x512"],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

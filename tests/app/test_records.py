@@ -35,9 +35,9 @@ def test_how_far_the_source_went_is_remembered_and_told(result, scan, tmp_path):
     assert "source_travel" not in summary_of(Record.of(result, scan), None)[0]
 
 
-def test_flagged_views_are_not_believed(record):
+def test_flagged_views_are_not_valid_views(record):
     assert record.flagged == (3, 17)
-    assert np.flatnonzero(~record.believed).tolist() == [3, 17]
+    assert np.flatnonzero(~record.valid_views).tolist() == [3, 17]
     assert record.scale_estimated
 
 
@@ -65,4 +65,4 @@ def test_a_file_of_shifts_alone_is_enough(record, tmp_path):
     bare = Record.load(tmp_path / "bare.h5")
     assert bare.motion == record.motion
     assert bare.history == () and bare.gauge == {} and bare.sigma is None
-    assert bare.flagged == () and bare.believed.all()
+    assert bare.flagged == () and bare.valid_views.all()

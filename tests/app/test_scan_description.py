@@ -56,7 +56,7 @@ def test_facts_of_a_scan():
     assert facts.fan_angle_deg == pytest.approx(2 * math.degrees(math.atan(4.5 * 0.5 / 400)))
     lines = facts.lines()
     assert lines["scan"] == "s (line-integrals)"
-    assert "7 rows x 9 columns" in lines["panel"]
+    assert "7 rows x 9 columns" in lines["detector"]
     assert "5 um" in lines["volume"]
     assert "simulation" in lines["known"]
     assert "mm a view" not in lines["trajectory"]  # a circle has no step along z

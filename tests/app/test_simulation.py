@@ -19,7 +19,7 @@ SHAPE = (41, 33)
 SHIFT = (-10.0, 8.0)
 
 
-def test_a_panel_of_the_papers_size_gives_the_papers_geometry():
+def test_a_detector_of_the_papers_size_gives_the_papers_geometry():
     paper = trajectory.PAPER
     assert paper_like("helix", 3456, paper["shape"]) == trajectory.helix(
         3456, angle_step=np.radians(0.5), **paper

@@ -253,8 +253,13 @@ def test_unknown_kind(nxtomo_file: Builder) -> None:
 
 
 def test_checksum_tells_scans_apart() -> None:
-    panel = {"source_to_axis": 3.0, "source_to_detector": 9.0, "pixel_size": 0.1, "shape": (3, 4)}
-    geometry = circular(5, **panel)
+    detector = {
+        "source_to_axis": 3.0,
+        "source_to_detector": 9.0,
+        "pixel_size": 0.1,
+        "shape": (3, 4),
+    }
+    geometry = circular(5, **detector)
     pixels = np.random.default_rng(0).random((5, 3, 4), np.float32)
     one = scan_checksum(Scan(pixels, geometry))
     assert one == scan_checksum(Scan(pixels.astype(np.float64), geometry, name="copy"))

@@ -18,9 +18,9 @@ MIB = 1 << 20
 AGREES = 0.2  # part by which prediction and measurement may differ
 
 
-def _scan(views=150, panel=(120, 96)):
-    geometry = paper_like("helix", views, panel)
-    pixels = np.random.default_rng(0).random((views, *panel), np.float32)
+def _scan(views=150, detector=(120, 96)):
+    geometry = paper_like("helix", views, detector)
+    pixels = np.random.default_rng(0).random((views, *detector), np.float32)
     return clra.Scan(pixels, geometry)
 
 
@@ -39,15 +39,15 @@ def test_reconstruction_takes_what_is_predicted(budget):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of noise nothing can be found
 @pytest.mark.parametrize(
-    ("panel", "level", "budget"),
+    ("detector", "level", "budget"),
     [
         ((120, 96), 2, None),
         ((120, 96), 2, 12 * MIB),
         ((300, 280), 1, 64 * MIB),  # large enough for registration without a correction
     ],
 )
-def test_alignment_takes_what_is_predicted(panel, level, budget, monkeypatch):
-    scan = _scan(150 if level == 2 else 40, panel)
+def test_alignment_takes_what_is_predicted(detector, level, budget, monkeypatch):
+    scan = _scan(150 if level == 2 else 40, detector)
     streams = []
 
     def remembered(*arguments, **options):

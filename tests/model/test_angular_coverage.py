@@ -9,8 +9,13 @@ import clra
 from clra.model.angular_coverage import angle_weights, part_of_a_turn
 from clra.model.trajectory import circular, helix
 
-PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 0.5, "shape": (7, 96)}
-PARALLEL = PANEL | {"source_to_axis": 5e4, "source_to_detector": 5e4}
+DETECTOR = {
+    "source_to_axis": 50.0,
+    "source_to_detector": 100.0,
+    "pixel_size": 0.5,
+    "shape": (7, 96),
+}
+PARALLEL = DETECTOR | {"source_to_axis": 5e4, "source_to_detector": 5e4}
 
 
 def _joined(*parts):
@@ -22,18 +27,18 @@ def _joined(*parts):
 @pytest.mark.parametrize("views", [1, 2, 7, 360])
 @pytest.mark.parametrize("turns", [0.5, 0.6, 1, 2, -3])
 def test_even_views_weigh_the_same_also_on_a_part_of_the_turn(views, turns):
-    geometry = circular(views, arc=2 * math.pi * turns, start=0.3, **PANEL)
+    geometry = circular(views, arc=2 * math.pi * turns, start=0.3, **DETECTOR)
     assert (angle_weights(geometry) == 1).all()
 
 
 def test_helices_are_left_alone():
-    assert (angle_weights(helix(50, angle_step=0.3, z_step=0.1, **PANEL)) == 1).all()
+    assert (angle_weights(helix(50, angle_step=0.3, z_step=0.1, **DETECTOR)) == 1).all()
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_views_weigh_as_much_as_the_angle_they_stand_for(shuffled):
-    dense = circular(240, arc=math.pi / 2, **PANEL)
-    sparse = circular(120, arc=1.5 * math.pi, start=math.pi / 2, **PANEL)
+    dense = circular(240, arc=math.pi / 2, **DETECTOR)
+    sparse = circular(120, arc=1.5 * math.pi, start=math.pi / 2, **DETECTOR)
     order = np.random.default_rng(0).permutation(360) if shuffled else np.arange(360)
     weights = np.empty(360)
     weights[order] = angle_weights(_joined(dense, sparse).subset(order))
@@ -44,7 +49,7 @@ def test_views_weigh_as_much_as_the_angle_they_stand_for(shuffled):
 
 
 def test_what_is_seen_in_two_turns_weighs_half_in_each():
-    weights = angle_weights(circular(300, arc=3 * math.pi, **PANEL))
+    weights = angle_weights(circular(300, arc=3 * math.pi, **DETECTOR))
     # In units of the first half of the turn's: 200 views of 1/2 and 100 of 1 have a mean of 2/3.
     assert weights[np.r_[6:94, 206:294]] == pytest.approx(0.5 / (2 / 3))
     assert weights[106:194] == pytest.approx(1 / (2 / 3))
@@ -53,18 +58,21 @@ def test_what_is_seen_in_two_turns_weighs_half_in_each():
 @pytest.mark.parametrize(
     ("geometry", "covered"),
     [
-        (circular(180, arc=math.radians(207), **PANEL), "207 degrees of the circle, expected 360"),
-        (circular(180, arc=math.pi, **PANEL), "180 degrees"),
+        (
+            circular(180, arc=math.radians(207), **DETECTOR),
+            "207 degrees of the circle, expected 360",
+        ),
+        (circular(180, arc=math.pi, **DETECTOR), "180 degrees"),
         (
             circular(180, arc=1.5 * math.pi, **PARALLEL),
             "270 degrees of the circle, expected 180 or",
         ),
-        (circular(180, **PANEL), ""),
-        (circular(270, arc=3 * math.pi, **PANEL), ""),
+        (circular(180, **DETECTOR), ""),
+        (circular(270, arc=3 * math.pi, **DETECTOR), ""),
         (circular(180, arc=math.pi, **PARALLEL), ""),
-        (circular(180, **PANEL).subset(np.r_[0:50, 53:180]), ""),
-        (circular(1, **PANEL), ""),
-        (helix(50, angle_step=0.05, z_step=0.1, **PANEL), ""),
+        (circular(180, **DETECTOR).subset(np.r_[0:50, 53:180]), ""),
+        (circular(1, **DETECTOR), ""),
+        (helix(50, angle_step=0.05, z_step=0.1, **DETECTOR), ""),
     ],
 )
 def test_a_part_of_a_turn_is_said(geometry, covered):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 
-# Rounding of float64 in pixels of a panel of 1e3, with room for ill-conditioned tilts.
+# Rounding of float64 in pixels of a detector of 1e3, with room for ill-conditioned tilts.
 PIXEL = 1e-8
 SHAPE = (37, 51)
 
@@ -139,7 +139,7 @@ def test_binning_keeps_every_pixel_where_it_was(shape, factor):
     geometry = tilted(shape=shape)
     binned = geometry.binned(factor)
     assert binned.shape == (shape[0] // factor, shape[1] // factor)
-    # Pixel k of the binned panel is the mean of the pixels factor k to factor k + factor - 1.
+    # Pixel k of the binned detector is the mean of the pixels factor k to factor k + factor - 1.
     expected = (geometry.project(points()) - (factor - 1) / 2) / factor
     np.testing.assert_allclose(binned.project(points()), expected, atol=PIXEL)
 
@@ -151,7 +151,7 @@ def test_binning_by_two_twice_is_binning_by_four():
     )
 
 
-def test_binning_away_the_panel_is_refused():
+def test_binning_away_the_detector_is_refused():
     with pytest.raises(ValueError, match="factor: found 40, expected at most 37"):
         tilted().binned(40)
 
@@ -171,7 +171,7 @@ def test_far_source_loses_no_precision():
     np.testing.assert_allclose(found, 2 + np.array([0.25, -0.5]) * (far + 1) / far, atol=1e-9)
 
 
-def test_distances_and_principal_point_of_an_offset_panel():
+def test_distances_and_principal_point_of_an_offset_detector():
     geometry = ConeBeamGeometry(
         source=[[0, -4, 2]],
         detector=[[1.5, 6, 2.2]],
@@ -185,7 +185,7 @@ def test_distances_and_principal_point_of_an_offset_panel():
     assert geometry.axial
 
 
-def test_distances_of_tilted_panels():
+def test_distances_of_tilted_detectors():
     geometry = tilted()
     foot = pixel_centre(geometry, *geometry.principal.T[..., None])
     ray = foot - geometry.source
@@ -254,7 +254,7 @@ GOOD = {
         ({"detector": [[0, np.nan, 0]]}, ValueError, "detector: found .* at 0 of the views"),
         ({"v": [[2, 0, 0]]}, ValueError, "u and v: parallel or zero in view 0"),
         ({"v": [[0, 0, 0]]}, ValueError, "u and v: parallel or zero in view 0"),
-        ({"source": [[5, 1, -4]]}, ValueError, "source: in the panel's plane in view 0"),
+        ({"source": [[5, 1, -4]]}, ValueError, "source: in the detector's plane in view 0"),
         ({"shape": (3, 0)}, ValueError, "shape: found 0, expected at least 1"),
         ({"shape": (3.0, 3)}, TypeError, "shape: found 3.0, expected a whole number"),
         ({"shape": 3}, ValueError, r"shape: found 3, expected \(rows, columns\)"),

@@ -86,7 +86,7 @@ def test_default_grid_of_a_circle():
     assert grid.centre == (0, 0, 0)
 
 
-def test_default_grid_takes_the_nearer_side_of_an_offset_panel():
+def test_default_grid_takes_the_nearer_side_of_an_offset_detector():
     geometry = circular(8, **CIRCLE)
     shifted = geometry.with_motion(Motion(shift_u=np.full(8, 7.0), shift_v=np.zeros(8)))
     half_fan = np.arctan((41 / 2 - 7) * 0.5 / 100)

@@ -23,7 +23,7 @@ def any_motion(seed, views=7):
 
 
 def moved(motion, pixel):
-    """Where the motion puts pixels counted from the panel's centre, (views, 2)."""
+    """Where the motion puts pixels counted from the detector's centre, (views, 2)."""
     shift = np.stack([motion.shift_u, motion.shift_v], axis=1)
     return motion.magnification[:, None] * pixel + shift
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 import clra
-from clra.model.detector_pose import with_panel
-from clra.model.rotation_sense import turned_back
+from clra.model.detector_pose import with_detector
+from clra.model.rotation_sense import opposite_rotation
 
 
 def _helix(angle_step: float) -> clra.ConeBeamGeometry:
@@ -17,14 +17,16 @@ def _helix(angle_step: float) -> clra.ConeBeamGeometry:
         pixel_size=0.5,
         shape=(15, 21),
     )
-    return with_panel(ideal, offset_u=2.5, tilt=0.02)
+    return with_detector(ideal, offset_u=2.5, tilt=0.02)
 
 
 def test_a_helix_with_its_offset_and_tilt_is_wound_the_other_way():
-    found, expected = turned_back(_helix(0.7)), _helix(-0.7)
+    found, expected = opposite_rotation(_helix(0.7)), _helix(-0.7)
     np.testing.assert_allclose(found.to_astra(), expected.to_astra(), rtol=0, atol=1e-12)
 
 
 def test_twice_is_none():
     there = _helix(0.7)
-    np.testing.assert_allclose(turned_back(turned_back(there)).to_astra(), there.to_astra())
+    np.testing.assert_allclose(
+        opposite_rotation(opposite_rotation(there)).to_astra(), there.to_astra()
+    )

@@ -19,13 +19,13 @@ def test_the_same_places_are_found_in_any_order():
     places = np.array([90, 3, 50, 49])
     match = match_views(scan, scan.subset(places), points)
     assert match.views.tolist() == places.tolist()
-    assert np.abs([match.distance, match.aside_u, match.aside_v]).max() < 1e-9
+    assert np.abs([match.distance, match.offset_u, match.offset_v]).max() < 1e-9
 
 
 def test_distance_is_in_pixels_and_the_mean_is_told():
     scan = circular(72, shape=(61, 67), **STAGE)
     points = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, -0.2]])
-    # A panel two columns and one row aside; the axis looks alike from everywhere.
+    # A detector two columns and one row aside; the axis looks alike from everywhere.
     other = scan.subset([5])
     moved = type(scan)(
         source=other.source,
@@ -36,9 +36,9 @@ def test_distance_is_in_pixels_and_the_mean_is_told():
     )
     match = match_views(scan, moved, points)
     assert match.distance == pytest.approx([math.sqrt(5)])
-    # A panel that lies lower sees the sample higher.
-    assert match.aside_u == pytest.approx([-2.0])
-    assert match.aside_v == pytest.approx([1.0])
+    # A detector that lies lower sees the sample higher.
+    assert match.offset_u == pytest.approx([-2.0])
+    assert match.offset_v == pytest.approx([1.0])
 
 
 def test_a_view_that_nobody_else_took_is_far():
@@ -48,7 +48,7 @@ def test_a_view_that_nobody_else_took_is_far():
     assert match_views(scan, other, points).distance.min() > 1.0
 
 
-def test_panels_have_to_be_alike():
+def test_detectors_have_to_be_alike():
     scan, other = (circular(9, shape=shape, **STAGE) for shape in ((61, 67), (61, 66)))
-    with pytest.raises(ValueError, match=r"panel: found 61 x 66 pixels, expected 61 x 67"):
+    with pytest.raises(ValueError, match=r"detector: found 61 x 66 pixels, expected 61 x 67"):
         match_views(scan, other, np.zeros((1, 3)))

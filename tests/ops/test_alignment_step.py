@@ -77,7 +77,7 @@ def test_cut_into_any_parts_and_orders_it_gives_the_same(context, queue, truth):
     np.testing.assert_allclose(estimates[:, :3], expected[0][:, :3], rtol=0, atol=2e-3)
 
 
-def test_expected_magnifications_are_handed_on(context, queue):
+def test_expected_magnifications_are_neighbour_weights(context, queue):
     """With no spread allowed the magnification stays what it is known to be."""
     measured = cl_array.to_device(queue, ROCK.line_integrals(GEOMETRY))
     estimates = cl_array.empty(queue, (VIEWS, len(ESTIMATE_FIELDS)), np.float32)

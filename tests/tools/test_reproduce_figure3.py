@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 TOOLS = Path(__file__).parents[2] / "tools"
-# Motions of 10 pixels carry the sample out of panels as small as these.
-pytestmark = pytest.mark.filterwarnings("ignore:the sample reaches beyond the panel")
+# Motions of 10 pixels carry the sample out of detectors as small as these.
+pytestmark = pytest.mark.filterwarnings("ignore:the sample reaches beyond the detector")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def tool():
 
 @pytest.fixture(scope="module")
 def folder(tool, tmp_path_factory):
-    """What one call leaves; at this size a panel has no quarter of 16 pixels, only a half."""
+    """What one call leaves; at this size a detector has no quarter of 16 pixels, only a half."""
     made = tmp_path_factory.mktemp("figures")
     tool("--scale", 16, "--schedules", "1HR", "-o", made)
     return made
@@ -48,7 +48,7 @@ def test_every_scan_is_aligned_by_both_estimators_and_kept(folder):
                 found = runs[f"16 {trajectory} {motion} {who} 1HR"]
                 assert [step["level"] for step in found["iterations"]] == ["HR"]
                 errors[who] = found["gauge_free_u"]
-            # A third of this panel's width is far for one iteration: motions are 4.5 pixels.
+            # A third of this detector's width is far for one iteration: motions are 4.5 pixels.
             assert 0 < errors["ours"] < errors["paper"] < 5
     assert len(runs) == 8
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from clra.app.arguments import interval, panel, pixel
+from clra.app.arguments import detector, interval, pixel
 from clra.app.console import Console, Memory, Reading, command
 
 ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
@@ -103,7 +103,7 @@ def import_scan(
         ),
     ],
     pixel_size: Annotated[
-        str, typer.Option(metavar="MM", help="Pixel of the panel; ROW,COLUMN where they differ.")
+        str, typer.Option(metavar="MM", help="Pixel of the detector; ROW,COLUMN where they differ.")
     ],
     source_distance: Annotated[
         float | None, typer.Option(metavar="MM", help="Source to rotation axis.")
@@ -158,7 +158,7 @@ def import_scan(
     ] = None,
     centre_offset: Annotated[
         float,
-        typer.Option(metavar="PIXEL", help="Column of the axis, from the panel's middle."),
+        typer.Option(metavar="PIXEL", help="Column of the axis, from the detector's middle."),
     ] = 0.0,
     rotation: Annotated[
         str,
@@ -193,7 +193,7 @@ def import_scan(
             flats_after=flat_after or (),
             darks=dark or (),
             kind=kind,
-            shape=panel("--shape", shape) if shape else None,
+            shape=detector("--shape", shape) if shape else None,
             dtype=dtype,
             byteorder=byteorder,
             header=header,
@@ -237,8 +237,8 @@ def simulate(
         float, typer.Option(metavar="X", help="Magnifications lie within 1 -+ X, about.")
     ] = 0.0,
     views: Annotated[int, typer.Option(metavar="N", help="Number of radiographs.")] = 720,
-    panel_size: Annotated[
-        str, typer.Option("--panel", metavar="ROWSxCOLUMNS", help="Pixels of the detector.")
+    detector_size: Annotated[
+        str, typer.Option("--detector", metavar="ROWSxCOLUMNS", help="Pixels of the detector.")
     ] = "384x256",
     phantom: Annotated[
         str,
@@ -277,7 +277,7 @@ def simulate(
     from clra.io.scan_files import write_scan
 
     ensure_writable(out)
-    geometry = paper_like(trajectory, views, panel("--panel", panel_size))
+    geometry = paper_like(trajectory, views, detector("--detector", detector_size))
     truth = simulated_motion(
         motion,
         geometry,

@@ -48,7 +48,7 @@ def align(
         bool,
         typer.Option(
             "--autofocus",
-            help="First find the column of the axis and the tilt of the panel.",
+            help="First find the column of the axis and the tilt of the detector.",
         ),
     ] = False,
     schedule: Annotated[
@@ -56,7 +56,7 @@ def align(
         typer.Option(
             metavar="TEXT",
             help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
-            "auto: 6ER-3QR on large panels, else QR until converged; then HR until converged. "
+            "auto: 6ER-3QR on large detectors, else QR until converged; then HR until converged. "
             "With imgr the levels of a cycle: QR-HR-FR.",
         ),
     ] = "auto",
@@ -174,7 +174,7 @@ def align(
         record.save(out)
         turned = sharpening_by_turning_back(
             opened.cropped(),
-            result.motion.about(*opened.window_aside),
+            result.motion.about(*opened.window_offset),
             console.device,
             progress=progress,
             **limits,
@@ -239,13 +239,13 @@ def correct(
 
     limits = memory.limits()
     opened = reading.scan(scan)
-    opened, known, believed = motion_for(opened, motion, reading.geometry())
+    opened, known, valid_views = motion_for(opened, motion, reading.geometry())
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns, keep=(scan, motion))
     with console.progress() as progress:
         corrected = correct_scan(opened, known, console.device, **limits)
-        write_scan(out, corrected, believed=believed, progress=progress)
-    invalid = (~believed).nonzero()[0].tolist()
+        write_scan(out, corrected, valid_views=valid_views, progress=progress)
+    invalid = (~valid_views).nonzero()[0].tolist()
     marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
     console.summary(
         {"file": out, "shape": opened.shape, "invalid": invalid},

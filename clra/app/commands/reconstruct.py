@@ -128,9 +128,9 @@ def reconstruct(
         initial = Path(options["initial"])
         options["initial"] = _start(initial, grid)
     sorted_options(method, options)
-    known = believed = None
+    known = valid_views = None
     if motion is not None:
-        opened, known, believed = motion_for(opened, motion, reading.geometry())
+        opened, known, valid_views = motion_for(opened, motion, reading.geometry())
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
     steps: tuple[Step, ...] = ()
@@ -141,7 +141,7 @@ def reconstruct(
                 out,
                 grid,
                 known,
-                believed,
+                valid_views,
                 align,
                 options,
                 iterating.resume,
@@ -158,7 +158,7 @@ def reconstruct(
                     grid=grid,
                     motion=known,
                     align=align,
-                    believed=believed,
+                    valid_views=valid_views,
                     device=console.device,
                     progress=progress,
                     **limits,
@@ -188,7 +188,7 @@ def _imgr(
     out: Path,
     grid: "VolumeGrid",
     motion: "Motion | None",
-    believed: "NDArray[np.bool_] | None",
+    valid_views: "NDArray[np.bool_] | None",
     align: bool,
     options: dict[str, Any],
     resume: bool,
@@ -200,7 +200,7 @@ def _imgr(
     import numpy as np
 
     from clra.app.exit_status import InterruptedCommandError
-    from clra.app.resuming import Leftover, fingerprint
+    from clra.app.resuming import SavedState, fingerprint
     from clra.io.volumes.volume_files import open_volume
     from clra.methods.reconstruction.imgr import imgr
     from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
@@ -213,13 +213,13 @@ def _imgr(
         "align": align,
         "motion": motion
         and f"{motion.cause} " + fingerprint(motion.shift_u, motion.shift_v, motion.magnification),
-        "believed": None if believed is None else fingerprint(believed),
+        "valid_views": None if valid_views is None else fingerprint(valid_views),
         "grid": fingerprint(np.array([*grid.shape, grid.voxel_size, *grid.centre])),
         **options,
     }
-    leftover = Leftover(out, scan, settings)
+    saved = SavedState(out, scan, settings)
     stream = Stream(usable_devices(console.device, progress)[0], report=progress, **limits)
-    progressed = leftover.load(stream, grid) if resume else None
+    state = saved.load(stream, grid) if resume else None
     try:
         found = imgr(
             stream,
@@ -227,19 +227,19 @@ def _imgr(
             grid,
             align=align,
             motion=motion,
-            believed=believed,
+            valid_views=valid_views,
             truth=scan.truth,
             osem=osem,
-            progressed=progressed,
+            state=state,
             **cycle,
         )
     except ReconstructionInterrupted as stopped:
-        leftover.save(stopped.progressed)
-        last = stopped.progressed.steps[-1]
+        saved.save(stopped.state)
+        last = stopped.state.steps[-1]
         raise InterruptedCommandError(
-            f"{leftover.folder} keeps cycle {last.cycle} up to {last.level}, --resume goes on"
+            f"{saved.folder} keeps cycle {last.cycle} up to {last.level}, --resume goes on"
         ) from None
     with open_volume(out, grid) as target:
         found.volume.write(target)
-    leftover.clear()
+    saved.clear()
     return found.steps

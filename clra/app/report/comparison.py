@@ -98,7 +98,7 @@ def compare(
     scan: Scan,
     motion: Motion,
     confidence: NDArray[np.float64],
-    believed: NDArray[np.bool_],
+    valid_views: NDArray[np.bool_],
     volume: Image | None = None,
 ) -> Comparison:
     """Reconstruct slices and re-project some views, without and with the motion.
@@ -113,13 +113,13 @@ def compare(
         As estimated.
     confidence : ndarray, (views,)
         Of the estimate; the view with the least is shown.
-    believed : ndarray of bool, (views,)
+    valid_views : ndarray of bool, (views,)
         Views to reconstruct from with the motion.
     volume : ndarray, (nz, ny, nx), optional
         By multigrid iteration, aligned: slices are of this one, and of one made without alignment.
     """
     slicer = (
-        Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS), believed)
+        Slicer(stream, scan, motion, _level(scan, _SLICE_COLUMNS), valid_views)
         if volume is None
         else MultigridSlicer(stream, scan, volume)
     )
@@ -132,7 +132,7 @@ def compare(
         detail=_detail(horizontal),
         voxel_mm=slicer.grid.voxel_size,
         method=slicer.method,
-        matches=_matches(stream, radiographs, scan.geometry, motion, confidence, believed),
+        matches=_matches(stream, radiographs, scan.geometry, motion, confidence, valid_views),
         pixel_mm=_grid(scan.geometry, level).voxel_size,
     )
 
@@ -181,7 +181,7 @@ def _matches(
     geometry: ConeBeamGeometry,
     motion: Motion,
     confidence: NDArray[np.float64],
-    believed: NDArray[np.bool_],
+    valid_views: NDArray[np.bool_],
 ) -> tuple[Match, ...]:
     chosen = _views_worth_showing(motion, confidence)
     views = sorted(chosen)
@@ -189,10 +189,10 @@ def _matches(
     grid = _grid(geometry, radiographs.level)
     differences, simulated = [], measured
     moved = geometry.with_motion(motion)
-    for name, full, used in (("before", geometry, None), ("after", moved, believed)):
+    for name, full, used in (("before", geometry, None), ("after", moved, valid_views)):
         here = full.binned(radiographs.level) if radiographs.level > 1 else full
         stage = f"report: volume {name}"
-        volume = ramp_fbp(stream, radiographs, here, grid, believed=used, stage=stage)
+        volume = ramp_fbp(stream, radiographs, here, grid, valid_views=used, stage=stage)
         simulated = _reprojected(stream, volume, here.subset(views))
         pairs = [_fitted(s, m) for s, m in zip(simulated, measured, strict=True)]
         simulated = np.stack(pairs)

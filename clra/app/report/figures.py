@@ -155,13 +155,13 @@ def convergence(history: Sequence[Iteration]) -> str:
     known = history[0].mae_u is not None
 
     def draw(figure: Figure) -> None:
-        panels = list(figure.subplots(1, 3 if known else 2, sharex=True))
+        detectors = list(figure.subplots(1, 3 if known else 2, sharex=True))
         number = np.arange(1, len(history) + 1)
-        _updates(panels[0], history, number)
+        _updates(detectors[0], history, number)
         if known:
-            _errors(panels[1], history, number)
-        _residuals(panels[-1], history, number)
-        for axes in panels:
+            _errors(detectors[1], history, number)
+        _residuals(detectors[-1], history, number)
+        for axes in detectors:
             axes.set_xlabel("iteration")
             axes.set_title(axes.get_title("left"), pad=18)  # above the names of the levels
             axes.set_xlim(0.5, len(history) + 0.5)
@@ -256,7 +256,7 @@ def confidence(values: Floats, flagged: Sequence[int]) -> str:
     values : ndarray, (views,)
         0 to 1.
     flagged : sequence of int
-        Views that are not believed.
+        Views that are rejected.
 
     Returns
     -------
@@ -264,16 +264,18 @@ def confidence(values: Floats, flagged: Sequence[int]) -> str:
         Data address of an image.
     """
     views = np.arange(len(values))
-    weak = np.isin(views, np.asarray(flagged, dtype=int))
+    rejected = np.isin(views, np.asarray(flagged, dtype=int))
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        _points(axes, views[~weak], values[~weak], U, "believed")
-        if weak.any():
-            axes.plot(views[weak], values[weak], "x", color=WARN, ms=6, mew=1.6, label="flagged")
+        _points(axes, views[~rejected], values[~rejected], U, "valid")
+        if rejected.any():
+            axes.plot(
+                views[rejected], values[rejected], "x", color=WARN, ms=6, mew=1.6, label="flagged"
+            )
             _legend(axes)
-        low = float(values[~weak].min()) if (~weak).any() else 0.0
-        axes.set_ylim(-0.05 if weak.any() else max(0.0, low - 0.1), 1.02)
+        low = float(values[~rejected].min()) if (~rejected).any() else 0.0
+        axes.set_ylim(-0.05 if rejected.any() else max(0.0, low - 0.1), 1.02)
         axes.set_xlim(-0.5, len(values) - 0.5)
         axes.set(xlabel="view", ylabel="confidence", title="Confidence of each view")
 

@@ -126,7 +126,7 @@ def _corrections(record: Record) -> str:
             figures.corrections(record.motion, returns=returns),
             "Shift (left) and magnification (right) that bring each measured radiograph back to "
             "where the ideal geometry puts it: the inverse of the estimated motion. Positive u is "
-            "toward higher columns, positive v toward higher rows; in pixels of the full panel."
+            "toward higher columns, positive v toward higher rows; in pixels of the full detector."
             + (_RETURNS if returns else ""),
             "Shift and magnification corrections against view number",
         ),

@@ -32,8 +32,8 @@ def images(pictures: Sequence[tuple[str, Floats, tuple[float, float]]], pixel_mm
     height = min(10.2 / sum(ratios), 7.0)
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, len(pictures), width_ratios=ratios, squeeze=False)[0]
-        for axes, (title, image, (black, white)) in zip(panels, pictures, strict=True):
+        detectors = figure.subplots(1, len(pictures), width_ratios=ratios, squeeze=False)[0]
+        for axes, (title, image, (black, white)) in zip(detectors, pictures, strict=True):
             axes.imshow(image, cmap="gray", vmin=black, vmax=white, interpolation="nearest")
             axes.set_title(title)
             axes.axis("off")

@@ -33,7 +33,7 @@ class Slicer:
         Of its views.
     level : int
         Binning factor to reconstruct at.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views for the slices after correction, all by default.
 
     Attributes
@@ -50,11 +50,11 @@ class Slicer:
         scan: Scan,
         motion: Motion,
         level: int,
-        believed: NDArray[np.bool_] | None = None,
+        valid_views: NDArray[np.bool_] | None = None,
     ) -> None:
         grid = default_grid(scan.geometry)
         self.grid = grid.binned(level) if level > 1 else grid
-        self._stream, self._believed = stream, believed
+        self._stream, self._valid_views = stream, valid_views
         self._radiographs = Radiographs(stream, scan, level)
         before, after = scan.geometry, scan.geometry.with_motion(motion)
         self._geometries = [g.binned(level) if level > 1 else g for g in (before, after)]
@@ -69,7 +69,7 @@ class Slicer:
             return
         self.method = "Katsevich's method"
         ideal = corrected(stream, scan, _at_level(motion, before.shape, level))
-        self._helical = helical, Radiographs(stream, without_gaps(ideal, believed), 1)
+        self._helical = helical, Radiographs(stream, without_gaps(ideal, valid_views), 1)
         self._geometries = [whole.geometry] * 2
 
     def images(self, plane: VolumeGrid) -> tuple[Image, Image]:
@@ -89,8 +89,10 @@ class Slicer:
         stream, stage = self._stream, "report: slices"
         if self.method.startswith("ramp"):
             volumes = [
-                ramp_fbp(stream, self._radiographs, geometry, plane, believed=believed, stage=stage)
-                for geometry, believed in ((before, None), (after, self._believed))
+                ramp_fbp(
+                    stream, self._radiographs, geometry, plane, valid_views=valid_views, stage=stage
+                )
+                for geometry, valid_views in ((before, None), (after, self._valid_views))
             ]
         else:
             volumes = [
@@ -144,12 +146,12 @@ def _upright(volume: Image) -> Image:
     return np.ascontiguousarray(volume[0] if len(volume) == 1 else volume[::-1, 0])
 
 
-def _at_level(motion: Motion, panel: tuple[int, int], level: int) -> Motion:
-    """Motion in pixels of the binned panel, about whose centre it magnifies."""
+def _at_level(motion: Motion, detector: tuple[int, int], level: int) -> Motion:
+    """Motion in pixels of the binned detector, about whose centre it magnifies."""
     # Rows and columns that binning drops move the centre by half as much.
-    aside_v, aside_u = (0.5 * (1 - motion.magnification) * (n % level) for n in panel)
+    offset_v, offset_u = (0.5 * (1 - motion.magnification) * (n % level) for n in detector)
     return Motion(
-        shift_u=(motion.shift_u + aside_u) / level,
-        shift_v=(motion.shift_v + aside_v) / level,
+        shift_u=(motion.shift_u + offset_u) / level,
+        shift_v=(motion.shift_v + offset_v) / level,
         magnification=motion.magnification,
     )

@@ -33,13 +33,13 @@ class Errors:
     raw, gauge_free : ndarray, (views, 3)
         Estimate minus truth along u and v [pixel] and in magnification, as it is and without what
         a movement of the sample as a whole explains.
-    believed : ndarray of bool, (views,)
+    valid_views : ndarray of bool, (views,)
         Views that were not flagged: the others' errors are those of a guess.
     """
 
     raw: Floats
     gauge_free: Floats
-    believed: NDArray[np.bool_]
+    valid_views: NDArray[np.bool_]
 
     @classmethod
     def of(cls, record: Record, scan: Scan) -> "Errors | None":
@@ -62,13 +62,13 @@ class Errors:
         )
         points = sample_points(default_grid(scan.geometry))
         fit = Gauge(scan.geometry, points, magnification=record.scale_estimated).fit(difference)
-        return cls(fit.part + fit.remainder, fit.remainder, record.believed)
+        return cls(fit.part + fit.remainder, fit.remainder, record.valid_views)
 
     def means(self) -> dict[str, float]:
-        """Mean absolute errors by name; those of believed views where some are not."""
+        """Mean absolute errors by name; those of valid views where some are not."""
         errors = {"mae": self.raw, "gauge_free_mae": self.gauge_free}
-        if not self.believed.all():
-            errors |= {f"believed_{name}": of[self.believed] for name, of in errors.items()}
+        if not self.valid_views.all():
+            errors |= {f"believed_{name}": of[self.valid_views] for name, of in errors.items()}
         components = ("u", "v", "magnification")
         return {
             f"{name}_{component}": float(mean)
@@ -148,21 +148,21 @@ def findings_of(
         report=progress,
     )
     part = scan.cropped()
-    motion = record.motion.about(*scan.window_aside)
+    motion = record.motion.about(*scan.window_offset)
     return Findings(
         record,
         errors=Errors.of(record, scan),
-        comparison=compare(stream, part, motion, record.confidence, record.believed, volume),
-        quality=quality(stream, part, motion, volume_level(part), record.believed)
-        if _in_both_halves(record.believed)
+        comparison=compare(stream, part, motion, record.confidence, record.valid_views, volume),
+        quality=quality(stream, part, motion, volume_level(part), record.valid_views)
+        if _in_both_halves(record.valid_views)
         else None,
         facts=Facts.of(scan).lines(),
     )
 
 
-def _in_both_halves(believed: NDArray[np.bool_]) -> bool:
+def _in_both_halves(valid_views: NDArray[np.bool_]) -> bool:
     """Whether two of the even views and two of the odd ones are left to compare."""
-    return bool(believed[::2].sum() > 1 and believed[1::2].sum() > 1)
+    return bool(valid_views[::2].sum() > 1 and valid_views[1::2].sum() > 1)
 
 
 def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], str]:
@@ -210,12 +210,12 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
     }
     if record.gauge:
         lines["unobservable"] = _unobservable(record)
-    if "panel_offset_u" in record.about:
-        offset, tilt = (record.about[name] for name in ("panel_offset_u", "panel_tilt"))
-        values |= {"panel_offset_u": offset, "panel_tilt": tilt}
-        lines["panel"] = (
+    if "detector_offset_u" in record.about:
+        offset, tilt = (record.about[name] for name in ("detector_offset_u", "detector_tilt"))
+        values |= {"detector_offset_u": offset, "detector_tilt": tilt}
+        lines["detector"] = (
             f"axis {offset} aside, image turned by {tilt}; slices sharper by a factor of "
-            f"{record.about.get('panel_sharpening', '?')}"
+            f"{record.about.get('detector_sharpening', '?')}"
         )
     if "source_travel" in record.about:
         values["source_travel"] = lines["source"] = record.about["source_travel"]

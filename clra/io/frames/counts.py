@@ -18,7 +18,7 @@ Frames = NDArray[np.intp]
 # A frame with more saturated pixels than this part of it is refused. Below, the saturated pixels
 # are hot ones or the edge of a beam; above, the sample itself has lost its contrast somewhere.
 _SATURATED = 0.01
-# Flats that are not above the dark in more than this part of the panel are no flats.
+# Flats that are not above the dark in more than this part of the detector are no flats.
 _DEAD = 0.5
 
 
@@ -115,15 +115,15 @@ class Radiographs:
                 "at least one, or the counts of the open beam: white= / --white "
                 "(1 for radiographs that are normalised already)",
             )  # fmt: skip
-        panel = self.shape[1:]
-        self._dark = self._mean(darks) if len(darks) else np.zeros(panel, np.float32)
+        detector = self.shape[1:]
+        self._dark = self._mean(darks) if len(darks) else np.zeros(detector, np.float32)
         if not len(darks):
             self._note("no dark frame: 0 counts taken as dark")
         if white is None:
             groups = [flats[start:stop] for start, stop in _runs(flats)]
         else:
             groups = []
-            self._flats.append(np.full(panel, white, np.float32) - self._dark)
+            self._flats.append(np.full(detector, white, np.float32) - self._dark)
         self._positions = np.array([float(group.mean()) for group in groups] or [0.0])
         self._flats += [self._mean(group, flat=True) - self._dark for group in groups]
         dead = np.any([flat <= 0 for flat in self._flats], axis=0)

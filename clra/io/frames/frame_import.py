@@ -87,10 +87,11 @@ def import_frames(
     detector_distance : float
         From rotation axis to detector [mm].
     pixel_size : float or (float, float)
-        Of the panel; (row, column) steps where they differ [mm].
+        Of the detector; (row, column) steps where they differ [mm].
     parallel : bool
-        The beam is parallel: a source so far away that rays end within 1/8000 of the panel's width
-        of where parallel ones would, and the detector at the axis, so that a voxel is a pixel.
+        The beam is parallel: a source so far away that rays end within 1/8000 of the detector's
+        width of where parallel ones would, and the detector at the axis, so that a voxel is a
+        pixel.
     flats, flats_after : path-like or list of path-like, optional
         Frames of the open beam, taken before and after the radiographs: with both, each radiograph
         is divided by what lies between, for its place.
@@ -109,8 +110,8 @@ def import_frames(
     z_translation : path-like, str or array_like, optional
         How far the sample is raised at each frame, given like `angles` [mm].
     centre_offset : float
-        Column at which the rotation axis is seen, from the panel's middle, positive toward higher
-        columns [pixel].
+        Column at which the rotation axis is seen, from the detector's middle, positive toward
+        higher columns [pixel].
     rotation : {"ccw", "cw"}
         How the sample turns as its angle grows, seen from above.
     name : str, optional
@@ -150,7 +151,7 @@ def import_frames(
             if part.shape[1:] != stack.shape[1:]:
                 found = f"{part.shape[1:]} pixels"
                 raise InputError.at(part.files[0], "frame", found, f"{stack.shape[1:]}")
-        views, panel = stack.shape[0], stack.shape[1:]
+        views, detector = stack.shape[0], stack.shape[1:]
         if kind != "counts" and stack.dtype.kind != "f":
             raise InputError.at(
                 stack.files[0], "pixels", stack.dtype, f"floating point, as {kind} have it"
@@ -170,13 +171,13 @@ def import_frames(
         turn = np.deg2rad(degrees)
         propagation = None
         if parallel or (source_distance is not None and np.isinf(source_distance)):
-            near, behind = far_source_distance(panel, column_step), 0.0
+            near, behind = far_source_distance(detector, column_step), 0.0
             propagation = detector_distance
         else:
             near = _distance("source_distance", source_distance)
             behind = _distance("detector_distance", detector_distance)
         translation = np.zeros((views, 3))
-        # Moving the axis rather than the panel keeps to what NXtomo can say.
+        # Moving the axis rather than the detector keeps to what NXtomo can say.
         translation[:, 0] = centre_offset * column_step * near / (near + behind)
         if z_translation is not None:
             translation[:, 2] = read_numbers(z_translation, "z_translation", views, told)
@@ -190,7 +191,7 @@ def import_frames(
         write_nxtomo(
             out,
             stack,
-            fields.geometry(panel),
+            fields.geometry(detector),
             flats=bright,
             flats_after=after,
             darks=dark,
@@ -205,7 +206,7 @@ def import_frames(
             views=views,
             flats=sum(part.shape[0] for part in (bright, after) if part is not None),
             darks=0 if dark is None else dark.shape[0],
-            shape=panel,
+            shape=detector,
             angles_deg=(float(degrees[0]), float(degrees[-1])),
         )
 

@@ -1,7 +1,7 @@
 """Geometries out and in: RTK's XML.
 
-RTK's axes are (x, z, -y) of ours: it turns about its y. It describes the physical panel and knows
-neither pixels nor which row of the image comes first.
+RTK's axes are (x, z, -y) of ours: it turns about its y. It describes the physical detector and
+knows neither pixels nor which row of the image comes first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from clra.model.geometry import ConeBeamGeometry
 Floats = NDArray[np.float64]
 
 _ROOT = "RTKThreeDCircularGeometry"
-# RTK's own limit on the cosine between the rows and columns of a panel.
+# RTK's own limit on the cosine between the rows and columns of a detector.
 _SKEW = 1e-6
 # Our numbers of one view, by the name that RTK's file has for each.
 _NAMES = (
@@ -39,20 +39,21 @@ _NAMES = (
 def write_rtk_geometry(path: str | os.PathLike[str], geometry: ConeBeamGeometry) -> None:
     """Write a geometry as RTK's XML; the file appears whole or not at all.
 
-    RTK wants rows that count along its own column axis, which is +z of ours for an upright panel.
-    Where ours count the other way (row 0 at the top), turn the radiographs upside down for RTK.
+    RTK wants rows that count along its own column axis, which is +z of ours for an upright
+    detector. Where ours count the other way (row 0 at the top), turn the radiographs upside down
+    for RTK.
 
     Parameters
     ----------
     path : path-like
         The file.
     geometry : ConeBeamGeometry
-        Its panels must be rectangular: u perpendicular to v.
+        Its detectors must be rectangular: u perpendicular to v.
 
     Raises
     ------
     InputError
-        If a panel is skewed: RTK cannot express it.
+        If a detector is skewed: RTK cannot express it.
     OutputError
         If the file cannot be written.
     """
@@ -86,21 +87,21 @@ def read_rtk_geometry(
     path : path-like
         The file.
     shape : (int, int)
-        Rows and columns of the panel, which RTK keeps with the images.
+        Rows and columns of the detector, which RTK keeps with the images.
     pixel_size : float or (float, float)
-        Of the panel; (row, column) steps where they differ [mm].
+        Of the detector; (row, column) steps where they differ [mm].
     top_down : bool
         Row 0 is the top of the radiographs; RTK's own stacks begin at the bottom.
 
     Returns
     -------
     ConeBeamGeometry
-        The panel is centred on RTK's origin of the projections.
+        The detector is centred on RTK's origin of the projections.
 
     Raises
     ------
     InputError
-        If it is no such file, or asks for what a flat panel cannot be.
+        If it is no such file, or asks for what a flat detector cannot be.
     """
     try:
         root = ElementTree.fromstring(Path(path).read_bytes())
@@ -113,7 +114,7 @@ def read_rtk_geometry(
         raise InputError.at(path, "root", found, f"<{_ROOT}> with at least one")
     curved = root.find(".//RadiusCylindricalDetector")
     if curved is not None and float(curved.text or 0) != 0:
-        raise InputError.at(path, "RadiusCylindricalDetector", curved.text, "0: a flat panel")
+        raise InputError.at(path, "RadiusCylindricalDetector", curved.text, "0: a flat detector")
     numbers = np.array([[_value(path, root, p, name) for name in _NAMES] for p in projections])
     return _from_rtk_numbers(numbers, shape, pixel_size, -1.0 if top_down else 1.0)
 
@@ -144,11 +145,12 @@ def _rtk_numbers(geometry: ConeBeamGeometry) -> Floats:
         view = int(np.argmax(skew))
         raise InputError(
             f"geometry: found u and v {np.rad2deg(np.arccos(skew[view])):.6f} degrees apart in "
-            f"view {view}, expected 90: RTK knows only rectangular panels"
+            f"view {view}, expected 90: RTK knows only rectangular detectors"
         )
     source, detector = _to_rtk(geometry.source), _to_rtk(geometry.detector)
     normal = np.cross(row, column)
-    # RTK's normal points at the source; a panel whose rows count the other way is the same panel.
+    # RTK's normal points at the source; a detector whose rows count the other way is the same
+    # detector.
     upside = np.sign(_dot(normal, source - detector))[:, None]
     column, normal = column * upside, normal * upside
     gantry = np.arctan2(normal[:, 0], normal[:, 2])
@@ -190,7 +192,7 @@ def _from_rtk_numbers(
 
 
 def _rtk_frames(gantry: Floats, out_of_plane: Floats, in_plane: Floats) -> Floats:
-    """Return row, column and normal direction of each panel, (views, 3, 3).
+    """Return row, column and normal direction of each detector, (views, 3, 3).
 
     They are the rows of the rotations Rz(-in_plane) Rx(-out_of_plane) Ry(-gantry).
     """
@@ -205,7 +207,7 @@ def _rtk_frames(gantry: Floats, out_of_plane: Floats, in_plane: Floats) -> Float
 
 
 def _rtk_matrices(numbers: Floats) -> Floats:
-    """Return the matrices from points to mm on the panel that RTK compares with the numbers."""
+    """Return the matrices from points to mm on the detector that RTK compares with the numbers."""
     frames = _rtk_frames(*np.deg2rad(numbers[:, 2:5]).T)
     matrices = np.zeros((len(numbers), 3, 4))
     for k, (sid, sdd, _, _, _, sx, sy, px, py) in enumerate(numbers):

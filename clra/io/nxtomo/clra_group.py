@@ -101,13 +101,13 @@ def read_truth(entry: h5py.Group, views: Views, count: int) -> Motion | None:
     InputError
         If it does not fit the frames.
     """
-    columns, cause = {}, "panel"
+    columns, cause = {}, "detector"
     for name in _MOTION_UNITS:
         dataset = find(entry, f"clra/motion_truth/{name}")
         if not isinstance(dataset, h5py.Dataset):
             return None
         columns[name] = _rows(dataset, views, (count,))
-        cause = text(dataset.parent.attrs.get("cause", cause))
+        cause = text(dataset.parent.attrs.get("cause", cause)).replace("panel", "detector")
     try:
         return Motion(**columns, cause=cause)
     except ValueError as error:

@@ -69,7 +69,7 @@ def read_fields(
     views : ndarray of int
         Which of them are radiographs.
     shape : (int, int)
-        Rows and columns of the panel.
+        Rows and columns of the detector.
     overrides : Overrides
         What the user says.
 

@@ -60,7 +60,7 @@ class Fields:
         Parameters
         ----------
         shape : (int, int)
-            Rows and columns of the panel.
+            Rows and columns of the detector.
         """
         nothing = np.zeros_like(self.angle)
         width, height = self.pixel
@@ -134,16 +134,16 @@ def top_down(geometry: ConeBeamGeometry) -> tuple[ConeBeamGeometry, bool]:
 def far_source_distance(shape: tuple[int, int], column_step: float) -> float:
     """Return the source distance that stands for a parallel beam [mm].
 
-    A point of the sample lies at most half a panel's width before or behind the axis, so that its
-    ray ends at most ``columns * max(rows, columns) * column_step / (4 distance)`` pixels beside the
-    parallel one: 1/8000 of the panel's width here, the same in every view. A source ten times as
-    far would do more harm: devices count in float32, and place a ray to within 6e-8 of the distance
-    of its source.
+    A point of the sample lies at most half a detector's width before or behind the axis, so that
+    its ray ends at most ``columns * max(rows, columns) * column_step / (4 distance)`` pixels beside
+    the parallel one: 1/8000 of the detector's width here, the same in every view. A source ten
+    times as far would do more harm: devices count in float32, and place a ray to within 6e-8 of the
+    distance of its source.
 
     Parameters
     ----------
     shape : (int, int)
-        Rows and columns of the panel.
+        Rows and columns of the detector.
     column_step : float
         Width of a pixel [mm].
     """

@@ -44,7 +44,7 @@ def write_nxtomo(
     name: str = "scan",
     truth: Motion | None = None,
     mask: NDArray[np.bool_] | None = None,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     fields: Fields | None = None,
     propagation_distance: float | None = None,
     progress: ProgressCallback | None = None,
@@ -74,7 +74,7 @@ def write_nxtomo(
         The motion that a simulation put in.
     mask : ndarray of bool, (rows, columns), optional
         True where the pixels may be used.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Radiographs to be used, at least one; the frames of others keep their places, and are marked
         as invalid ones. All by default.
     fields : Fields, optional
@@ -101,13 +101,13 @@ def write_nxtomo(
     for _, part in parts:
         if tuple(part.shape[1:]) != geometry.shape:
             raise InputError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
-    if believed is None:
-        believed = np.ones(geometry.views, np.bool_)
-    believed = believed_views(believed, geometry.views)
+    if valid_views is None:
+        valid_views = np.ones(geometry.views, np.bool_)
+    valid_views = believed_views(valid_views, geometry.views)
     pixels = np.dtype(dtype if dtype is not None else radiographs[0:1].dtype).newbyteorder("=")
     roles = np.concatenate([np.full(part.shape[0], role, np.int32) for role, part in parts])
     views = np.flatnonzero(roles == PROJECTION)
-    roles[views[~believed]] = INVALID
+    roles[views[~valid_views]] = INVALID
     shape = (len(roles), *geometry.shape)
     geometry, reverse = top_down(geometry)
     if reverse and truth is not None:

@@ -10,7 +10,7 @@ Floats = NDArray[np.float64]
 # Tikhonov weight relative to the squared length of each difference: at a tenth of it random motions
 # make the extrapolation noisy, at ten times it slow modes stay slow.
 _DAMPING = 1e-3
-# An extrapolated step longer than this many plain ones is not believed.
+# An extrapolated step longer than this many plain ones is rejected.
 _LONGEST = 3.0
 
 
@@ -26,7 +26,7 @@ class Anderson:
     memory : int
         Differences kept; 0 leaves the iteration plain.
     floor : float
-        Steps below this length are always believed, in the units of x.
+        Steps below this length are always valid_views, in the units of x.
 
     References
     ----------
@@ -77,7 +77,7 @@ class MotionSteps:
     anderson : Anderson
         Which knows no steps yet.
     shape : (int, int)
-        Rows and columns of the full-resolution panel.
+        Rows and columns of the full-resolution detector.
     scale : bool
         Whether magnifications are estimated.
     """

@@ -52,9 +52,9 @@ def align(
         drift against a reference scan alone, without any reconstruction.
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
-        panel of 384 pixels and more "6ER-3QR", else a quarter of the resolution until converged (at
-        most 20 iterations), then half until converged (at most 3, often one). For "imgr" the levels
-        of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
+        detector of 384 pixels and more "6ER-3QR", else a quarter of the resolution
+        until converged (at most 20 iterations), then half until converged (at most 3, often one).
+        For "imgr" the levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
         source that moved, in all three directions: this explains the parallax by which what is
@@ -105,9 +105,9 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
-    # What the mask leaves of the panel is aligned as a panel of its own.
+    # What the mask leaves of the detector is aligned as a detector of its own.
     whole, scan = scan, scan.cropped()
-    aside = whole.window_aside
+    aside = whole.window_offset
     stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
     stream = Stream(
         device,
@@ -122,13 +122,13 @@ def align(
             reference = replace(reference, mask=whole.mask).cropped()
         drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
         if method == "reference":
-            return _on_panel(drift, whole)
+            return _on_detector(drift, whole)
         motion = drift.motion
     grid = grid or default_grid(scan.geometry)
     solver, anchor = solver or Solver(), gauge == "anchored"
     scale = estimate != "shift" and solver.estimator == "gauss-newton"
     start = motion or Motion.identity(scan.views)
-    start = start.caused_by("source" if estimate == "source" else "panel")
+    start = start.caused_by("source" if estimate == "source" else "detector")
     try:
         if method == "imgr":
             solved = _by_imgr(
@@ -142,20 +142,20 @@ def align(
                 motion=start,
                 truth=truth,
             )
-            return _on_panel(solved, whole)
+            return _on_detector(solved, whole)
         run = CoarseToFine(
             stream, scan, with_margin(grid), schedule, scale, anchor, solver, start, truth
         )
         run.align(stages)
     except AlignmentInterrupted as stopped:
-        raise AlignmentInterrupted(_on_panel(stopped.result, whole)) from None
-    return _on_panel(run.result(), whole)
+        raise AlignmentInterrupted(_on_detector(stopped.result, whole)) from None
+    return _on_detector(run.result(), whole)
 
 
-def _on_panel(result: AlignmentResult, scan: Scan) -> AlignmentResult:
-    """Return a result for what the mask leaves as one for the whole panel."""
-    aside_u, aside_v = scan.window_aside
-    return replace(result, motion=result.motion.about(-aside_u, -aside_v))
+def _on_detector(result: AlignmentResult, scan: Scan) -> AlignmentResult:
+    """Return a result for what the mask leaves as one for the whole detector."""
+    offset_u, offset_v = scan.window_offset
+    return replace(result, motion=result.motion.about(-offset_u, -offset_v))
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:

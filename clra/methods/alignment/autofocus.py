@@ -1,7 +1,7 @@
-"""Auto-focus: the column of the axis and the tilt of the panel that make slices sharpest.
+"""Auto-focus: the column of the axis and the tilt of the detector that make slices sharpest.
 
 Re-projection alignment takes the static geometry for granted: a wrong centre of rotation it can
-still shift away, a panel turned in its plane it cannot. A few slices are reconstructed with many
+still shift away, a detector turned in its plane it cannot. A few slices are reconstructed with many
 candidates and the sharpest is taken [1]_. Where the radiographs jitter, what is sharpest is off by
 some tenths of a pixel and of a degree: a short alignment at a low resolution finds most of the
 jitter, and with it known the slices are made as sharp as they can be.
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from clra.errors import InputError
 from clra.methods.alignment.align import align
 from clra.model.angular_coverage import covered
-from clra.model.detector_pose import with_panel
+from clra.model.detector_pose import with_detector
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
-from clra.model.rotation_sense import turned_back
+from clra.model.rotation_sense import opposite_rotation
 from clra.model.scan import Scan
 from clra.model.schedule import level_name
 from clra.ops.filtering.ramp import RampFilter, taper
@@ -43,7 +43,7 @@ Floats = NDArray[np.float64]
 # Views that are looked at; most columns in the search and in the refinement; and part of the rows
 # over which a view fades out, as for ramp-filtered back-projection.
 _VIEWS, _SEARCH_COLUMNS, _COLUMNS, _FADE = 240, 96, 200, 0.1
-# The search: offsets up to an eighth of the panel's width either way, and tilts [rad].
+# The search: offsets up to an eighth of the detector's width either way, and tilts [rad].
 _OFFSETS = np.linspace(-0.125, 0.125, 25)
 _TILTS = np.radians(np.linspace(-2.0, 2.0, 9))
 # Slices, and the part of the field of view's height over which they are spread: a tilt shows far
@@ -66,9 +66,10 @@ class Focus:
     Attributes
     ----------
     offset_u : float
-        Column of the axis' shadow from where the scan's geometry puts it [pixel of the full panel].
+        Column of the axis' projection from where the scan's geometry puts it [pixel of the full
+        detector].
     tilt : float
-        Angle by which the panel's image is turned, from columns toward rows [rad].
+        Angle by which the detector's image is turned, from columns toward rows [rad].
     sharpening : float
         Mean squared gradient of the slices, relative to that of the scan's own geometry.
     """
@@ -79,7 +80,7 @@ class Focus:
 
     def applied(self, scan: Scan) -> Scan:
         """Return the scan with its geometry corrected."""
-        geometry = with_panel(scan.geometry, offset_u=self.offset_u, tilt=self.tilt)
+        geometry = with_detector(scan.geometry, offset_u=self.offset_u, tilt=self.tilt)
         return replace(scan, geometry=geometry)
 
 
@@ -91,7 +92,7 @@ def autofocus(
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
 ) -> Focus:
-    """Find the column of the axis and the tilt of the panel.
+    """Find the column of the axis and the tilt of the detector.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ def autofocus(
     Returns
     -------
     Focus
-        Offsets up to an eighth of the panel's width are searched, tilts up to 2 degrees.
+        Offsets up to an eighth of the detector's width are searched, tilts up to 2 degrees.
 
     Raises
     ------
@@ -117,10 +118,10 @@ def autofocus(
     """
     angle = covered(scan.geometry)
     if angle < 2 * math.pi:
-        # Slices of half a turn are sharpest with a panel tilted by 3 degrees too much.
+        # Slices of half a turn are sharpest with a detector tilted by 3 degrees too much.
         raise InputError(
             f"{scan.name}: found views over {math.degrees(angle):.0f} degrees, expected a whole "
-            "turn to find the axis and the panel's tilt by"
+            "turn to find the axis and the detector's tilt by"
         )
     limits: dict[str, Any] = {
         "max_device_memory": max_device_memory,
@@ -131,7 +132,7 @@ def autofocus(
     scan = scan.subset(slice(0, None, every))
     coarse = _Slices(stream, scan, scan.geometry, _SEARCH_COLUMNS, _SEARCH_INSIDE)
     rough = _searched(coarse, scan)
-    focused = replace(scan, geometry=with_panel(scan.geometry, offset_u=rough[0], tilt=rough[1]))
+    focused = replace(scan, geometry=with_detector(scan.geometry, offset_u=rough[0], tilt=rough[1]))
     schedule = f"{_ITERATIONS}{level_name(_level(scan, coarse.pixel))}"
     del coarse  # its memory is the alignment's
     with warnings.catch_warnings():
@@ -198,7 +199,7 @@ def sharpening_by_turning_back(
     )
     chosen = slice(0, None, max(1, scan.views // _VIEWS))
     scan, motion = scan.subset(chosen), motion.subset(chosen)
-    ours, other = (g.with_motion(motion) for g in (scan.geometry, turned_back(scan.geometry)))
+    ours, other = (g.with_motion(motion) for g in (scan.geometry, opposite_rotation(scan.geometry)))
     try:
         slices = _Slices(stream, scan, ours, _COLUMNS, _INSIDE)
         slices.sharpnesses(ours)
@@ -257,13 +258,13 @@ def _climbed(slices: "_Slices") -> tuple[float, float]:
 
 
 class _Slices:
-    """Slices of a scan whose filtered radiographs are kept, for any panel."""
+    """Slices of a scan whose filtered radiographs are kept, for any detector."""
 
     def __init__(
         self, stream: Stream, scan: Scan, geometry: ConeBeamGeometry, columns: int, inside: float
     ) -> None:
         self.stream, self._geometry = stream, geometry
-        # Pixels of the full panel in one of these radiographs.
+        # Pixels of the full detector in one of these radiographs.
         self.pixel = next((n for n in (1, 2, 4) if geometry.columns // n <= columns), 8)
         radiographs = Radiographs(stream, scan, self.pixel)
         binned = geometry.binned(self.pixel)
@@ -297,8 +298,8 @@ class _Slices:
         self._first: Floats | None = None
 
     def sharpness(self, offset: float, tilt: float) -> float:
-        """Mean over the slices of their sharpness with the panel elsewhere."""
-        moved = with_panel(self._geometry, offset_u=offset, tilt=tilt)
+        """Mean over the slices of their sharpness with the detector elsewhere."""
+        moved = with_detector(self._geometry, offset_u=offset, tilt=tilt)
         return float(np.mean(self.sharpnesses(moved)))
 
     def sharpnesses(self, geometry: ConeBeamGeometry) -> Floats:

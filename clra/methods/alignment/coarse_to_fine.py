@@ -1,9 +1,10 @@
 """Re-projection alignment from coarse to fine: Algorithms 1 and 2 of the paper.
 
 Reconstruct from the radiographs as they are, project the volume forward, register each measured
-radiograph with its simulated twin, correct, repeat; first at a quarter of the resolution, then at
-half. The correction is absorbed into the geometry: no radiograph is resampled, and the simulated
-ones come out in the frame of the measured ones, so that what registration finds is what is left.
+radiograph with its simulated counterpart, correct, repeat; first at a quarter of the resolution,
+then at half. The correction is absorbed into the geometry: no radiograph is resampled, and the
+simulated ones come out in the frame of the measured ones, so that what registration finds is what
+is left.
 """
 
 import time
@@ -17,7 +18,7 @@ from clra.methods.alignment.acceleration import MotionSteps
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.rejected_views import from_neighbours, odd_radiographs, outliers
+from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration
 from clra.model.gauge.gauge import Gauge, sample_points
@@ -70,10 +71,10 @@ class CoarseToFine:
     history: list[Iteration] = field(init=False, default_factory=list)
     registered: Registered = field(init=False)
     found: Motion = field(init=False)  # by the last iteration, with its gauge
-    last: tuple[int, Floats] = field(init=False)  # its level, and updates of views believed
+    last: tuple[int, Floats] = field(init=False)  # its level, and updates of valid views
     fresh: bool = field(init=False)  # nothing was known of the motion before it
     steps: MotionSteps = field(init=False)  # of the level
-    weak: NDArray[np.bool_] = field(init=False)
+    rejected: NDArray[np.bool_] = field(init=False)
 
     def __post_init__(self) -> None:
         self.motion = self.start
@@ -100,7 +101,7 @@ class CoarseToFine:
         # 1, 7: down-sample the measured radiographs
         level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
         if not self.history:
-            self.weak = odd_radiographs(self.stream, level.radiographs)
+            self.rejected = unusable_radiographs(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
         # that one, its first steps would go astray.
         steps = self.solver.acceleration()
@@ -110,11 +111,11 @@ class CoarseToFine:
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(level, title=of)
-            wrong = outliers(found.correlation) & ~self.weak
+            wrong = outliers(found.correlation) & ~self.rejected
             if not self.history and wrong.any():
                 # They were in the first volume: again without, or what they did to the others stays
                 # in the modes that data hardly see, a tenth of all that is left of random motion.
-                self.weak, level.bias = self.weak | wrong, None
+                self.rejected, level.bias = self.rejected | wrong, None
                 found = self._iterate(level, title=of)
             step, note = self._move(found, stage.level)
             update = np.abs(step)
@@ -130,8 +131,8 @@ class CoarseToFine:
                     **self._errors(),
                 )
             )
-            # 6, 13: until converged, whatever becomes of views that are not believed
-            update_u, update_v = update[:, ~self.weak]
+            # 6, 13: until converged, whatever becomes of views that are rejected
+            update_u, update_v = update[:, ~self.rejected]
             if stage.iterations is None and converged(
                 update_u, update_v, previous, stage.tolerance
             ):
@@ -150,7 +151,7 @@ class CoarseToFine:
         return level.residual_motion(
             self.motion,
             self.motion.magnification / self.start.magnification,
-            believed=~self.weak,
+            valid_views=~self.rejected,
             first=first,
             magnification=self.scale and not shifts_only,
             measure=not shifts_only,
@@ -163,18 +164,18 @@ class CoarseToFine:
         Returns the plain step in u and v, and what was warned of.
         """
         self.registered = found
-        self.weak = outliers(found.correlation)
-        self.found = from_neighbours(self.motion.then(found.motion), self.weak).normalised()
+        self.rejected = outliers(found.correlation)
+        self.found = from_neighbours(self.motion.then(found.motion), self.rejected).normalised()
         there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
         step = self.steps.step(self.motion, there)
-        believed = np.abs(step[:, ~self.weak])
+        valid_views = np.abs(step[:, ~self.rejected])
         if self.history:
-            note = warned(false_shifts(*self.last, level, believed))
+            note = warned(false_shifts(*self.last, level, valid_views))
             self.fresh = bool(note)
         else:
             note = warned(far_motion(found.motion, level))
             self.fresh = True
-        self.last = level, believed
+        self.last = level, valid_views
         # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
@@ -197,7 +198,7 @@ class CoarseToFine:
             self.motion,
             self.history,
             self.registered,
-            self.weak,
+            self.rejected,
             self.gauge.fit(self.found),
             self.schedule,
             self.stream.device.name,

@@ -63,7 +63,7 @@ class Level:
         motion: Motion,
         known: NDArray[np.float64],
         *,
-        believed: NDArray[np.bool_],
+        valid_views: NDArray[np.bool_],
         first: bool,
         magnification: bool,
         measure: bool,
@@ -77,7 +77,7 @@ class Level:
             As known so far, in pixels of full resolution.
         known : ndarray, (views,)
             Its magnification against the one that is expected.
-        believed : ndarray of bool, (views,)
+        valid_views : ndarray of bool, (views,)
             Views to reconstruct from, at least one.
         first : bool
             Whether nothing is known of the motion yet.
@@ -97,7 +97,7 @@ class Level:
                 radiographs,
                 geometry,
                 self.grid,
-                believed=believed,
+                valid_views=valid_views,
                 circle=self.solver.circle,
                 stage=f"{title}: {doing}",
             )
@@ -116,7 +116,7 @@ class Level:
                     magnification=magnification,
                 ),
                 magnification=known,
-                panel=self.scan.geometry.shape,
+                detector=self.scan.geometry.shape,
                 stage=f"{title}: {doing}",
             )
 

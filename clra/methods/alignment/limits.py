@@ -29,12 +29,12 @@ _VIEWS, _SCALE = 12, 16
 
 
 def far_motion(found: Motion, level: int) -> str:
-    """Say so if many views moved as far as registration looks.
+    """Return a warning if many views moved as far as registration looks.
 
     Parameters
     ----------
     found : Motion
-        By the first registration [pixel of the full-resolution panel].
+        By the first registration [pixel of the full-resolution detector].
     level : int
         Binning factor.
 
@@ -56,7 +56,7 @@ def far_motion(found: Motion, level: int) -> str:
 
 
 def false_shifts(level: int, last: Floats, finer: int, first: Floats) -> str:
-    """Say so if a level shows that what the coarser one before it found was not the motion.
+    """Return a warning if a level contradicts what the coarser one before it found.
 
     Where features are lost, views settle at shifts that fit by chance. They agree with a volume
     made from views that lie like that, their correlation is high, but the next level disagrees.
@@ -67,7 +67,7 @@ def false_shifts(level: int, last: Floats, finer: int, first: Floats) -> str:
         Binning factors; nothing is said unless the second is the smaller one.
     last, first : ndarray, (2, views)
         Absolute updates of the shifts in u and v by the last iteration of the former and by the
-        first of the latter [pixel of the full-resolution panel].
+        first of the latter [pixel of the full-resolution detector].
 
     Returns
     -------
@@ -90,7 +90,7 @@ def false_shifts(level: int, last: Floats, finer: int, first: Floats) -> str:
 
 
 def lost_features(scan: Scan, correlation: Floats, level: int) -> str:
-    """Say so if radiographs and re-projections have little in common at a level.
+    """Return a warning if radiographs and re-projections have little in common at a level.
 
     Parameters
     ----------

@@ -33,8 +33,8 @@ class Quality:
         radiograph's own.
     half_u, half_v : float
         Median over the views of how far the shifts that two volumes ask for differ, one of them
-        from every second of the views believed, one from those between [pixel of the
-        full-resolution panel].
+        from every second of the valid views, one from those between [pixel of the
+        full-resolution detector].
     sharpness : float
         Mean squared gradient of the volume after, relative to before.
     """
@@ -52,7 +52,7 @@ def quality(
     scan: Scan,
     motion: Motion,
     level: int,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
 ) -> Quality:
     """Measure how good an alignment is by the radiographs alone.
 
@@ -69,10 +69,10 @@ def quality(
         Of its views.
     level : int
         Binning factor.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views to reconstruct from with the motion, at least two; all by default.
     """
-    used = np.ones(scan.views, np.bool_) if believed is None else believed
+    used = np.ones(scan.views, np.bool_) if valid_views is None else valid_views
     grid = default_grid(scan.geometry).binned(level)
     radiographs = Radiographs(stream, scan, level)
     before, after = (g.binned(level) for g in (scan.geometry, scan.geometry.with_motion(motion)))
@@ -90,20 +90,20 @@ def quality(
                 stream, scan, radiographs, first=False, magnification=scale, still=still
             ),
             magnification=np.ones(scan.views),
-            panel=scan.geometry.shape,
+            detector=scan.geometry.shape,
             stage=f"report: re-projecting {name}",
         )
 
     unexplained, gradients = [], []
     for name, geometry, chosen in (("before", before, None), ("after", after, used)):
         stage = f"report: volume {name}"
-        volume = ramp_fbp(stream, radiographs, geometry, grid, believed=chosen, stage=stage)
+        volume = ramp_fbp(stream, radiographs, geometry, grid, valid_views=chosen, stage=stage)
         found = registered(geometry, volume, name, still=True)
         unexplained.append(float(np.median(np.sqrt(1 - np.clip(found.correlation, 0, 1) ** 2))))
         gradients.append(_gradient(volume.to_host()))
     halves = []
     for name, first in (("even views", 0), ("odd views", 1)):
-        # Of those believed: bad ones may well be every second view.
+        # Of the valid ones: bad ones may well be every second view.
         half = np.flatnonzero(used)[first::2]
         part = Radiographs(stream, Scan(radiographs, after).subset(half), 1)
         stage = f"report: volume of {name}"

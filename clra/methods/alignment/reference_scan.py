@@ -51,7 +51,7 @@ _BEYOND = 0.15
 # Points of the sample by which views are compared: twice as many find the same pairs.
 _POINTS = 40
 # Resolutions at which pairs are registered: a quarter catches drifts of 64 pixels; full resolution,
-# of radiographs corrected by that, is ten times as good on panels of 128 columns.
+# of radiographs corrected by that, is ten times as good on detectors of 128 columns.
 _LEVELS = (4, 1)
 
 
@@ -146,7 +146,7 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
     Raises
     ------
     InputError
-        If the panels differ or fewer than five reference views have a view alike.
+        If the detectors differ or fewer than five reference views have a view alike.
     """
     points = sample_points(default_grid(scan.geometry), count=_POINTS)
     try:
@@ -173,8 +173,8 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
     found = _registered(stream, scan.subset(views), reference.subset(pairs), scale)
     # What the two geometries know to differ is no drift.
     drift = Motion(
-        shift_u=found.motion.shift_u - match.aside_u[pairs],
-        shift_v=found.motion.shift_v - match.aside_v[pairs],
+        shift_u=found.motion.shift_u - match.offset_u[pairs],
+        shift_v=found.motion.shift_v - match.offset_v[pairs],
         magnification=found.motion.magnification,
     )
     good = ~outliers(found.correlation)

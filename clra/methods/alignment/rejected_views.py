@@ -1,4 +1,4 @@
-"""Views that are not believed: blank, saturated, or not of this sample."""
+"""Views that are rejected: blank, saturated, or not of this sample."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 
-# A view is not believed if its correlation lies this many robust standard deviations, and at least
+# A view is rejected if its correlation lies this many robust standard deviations, and at least
 # this much, below the others'; where all others lack little to 1, ten times what they lack will do.
 # In a stack of spheres, alike from everywhere, a wrong frame lacks 20 to 30 times as much; views of
 # a porous sample that are in order, twice.
@@ -28,10 +28,10 @@ _NEIGHBOURS = 9
 # lattice, where 4 leave the worst of six choices 10 % more error in u than no gap would, 6 leave
 # 5 %, 10 no less; on a helix nearly all goes to the two beside it. And the most that each takes: a
 # long gap stays a gap rather than become streaks of the views beside it.
-_HEIRS, _MOST = 6, 1.0
+_NEIGHBOURS, _MOST = 6, 1.0
 
 
-def odd_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
+def unusable_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
     """Find blank, dark and saturated radiographs by their pixels alone.
 
     Parameters
@@ -61,7 +61,7 @@ def sums_of(images: NDArray[np.float32]) -> Floats:
 
 
 def odd(sums: Floats) -> NDArray[np.bool_]:
-    """Find what :func:`odd_radiographs` does from what :func:`sums_of` gives.
+    """Find what :func:`unusable_radiographs` does from what :func:`sums_of` gives.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
     Parameters
     ----------
     correlation : ndarray, (views,)
-        Of each measured radiograph with its simulated twin, after registration.
+        Of each measured radiograph with its simulated counterpart, after registration.
 
     Returns
     -------
@@ -101,13 +101,13 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
 
 
 def all_but(flagged: Sequence[int], views: int) -> NDArray[np.bool_]:
-    """Return which of the views are believed, (views,): all but the flagged ones."""
-    believed = np.ones(views, np.bool_)
-    believed[list(flagged)] = False
-    return believed
+    """Return which of the views are valid_views, (views,): all but the flagged ones."""
+    valid_views = np.ones(views, np.bool_)
+    valid_views[list(flagged)] = False
+    return valid_views
 
 
-def handed_on(source: Floats, believed: NDArray[np.bool_]) -> Floats:
+def neighbour_weights(source: Floats, valid_views: NDArray[np.bool_]) -> Floats:
     """Hand the weight of views that are left out of a reconstruction on to those beside them.
 
     Without that a gap in the directions draws the volume, and with it the motions of all others
@@ -117,7 +117,7 @@ def handed_on(source: Floats, believed: NDArray[np.bool_]) -> Floats:
     ----------
     source : ndarray, (views, 3)
         Positions of the source [mm]; views beside each other look from nearly the same.
-    believed : ndarray of bool, (views,)
+    valid_views : ndarray of bool, (views,)
         Views to reconstruct from, at least one.
 
     Returns
@@ -125,38 +125,40 @@ def handed_on(source: Floats, believed: NDArray[np.bool_]) -> Floats:
     ndarray, (views,)
         Weights: 0 for views left out, 1 to 2 for the others, by the inverse squared distance.
     """
-    weights = believed.astype(np.float64)
-    heirs = np.flatnonzero(believed)
-    if len(heirs) == len(believed):
+    weights = valid_views.astype(np.float64)
+    neighbours = np.flatnonzero(valid_views)
+    if len(neighbours) == len(valid_views):
         return weights
-    count = min(_HEIRS, len(heirs))
-    distance, nearest = KDTree(source[heirs]).query(source[~believed], k=range(1, count + 1))
+    count = min(_NEIGHBOURS, len(neighbours))
+    distance, nearest = KDTree(source[neighbours]).query(
+        source[~valid_views], k=range(1, count + 1)
+    )
     near = 1 / np.maximum(distance, np.finfo(np.float32).eps * np.abs(source).max()) ** 2
-    taken = np.zeros(len(heirs))
+    taken = np.zeros(len(neighbours))
     np.add.at(taken, nearest, near / near.sum(axis=1, keepdims=True))
-    weights[heirs] += np.minimum(taken, _MOST)
+    weights[neighbours] += np.minimum(taken, _MOST)
     return weights
 
 
-def from_neighbours(motion: Motion, weak: NDArray[np.bool_]) -> Motion:
-    """Replace the motion of weak views by what lies between their neighbours'.
+def from_neighbours(motion: Motion, rejected: NDArray[np.bool_]) -> Motion:
+    """Replace the motion of rejected views by what lies between their neighbours'.
 
     Parameters
     ----------
     motion : Motion
         Of all views.
-    weak : ndarray of bool, (views,)
-        Views not to be believed; not all of them.
+    rejected : ndarray of bool, (views,)
+        Views rejected; not all of them.
 
     Returns
     -------
     Motion
-        Linear in view number across the weak views, unchanged elsewhere.
+        Linear in view number across the rejected views, unchanged elsewhere.
     """
-    if not weak.any():
+    if not rejected.any():
         return motion
     views = np.arange(motion.views)
-    good = views[~weak]
+    good = views[~rejected]
 
     def filled(values: Floats) -> Floats:
         return np.interp(views, good, values[good])

@@ -48,7 +48,7 @@ _STILL = 1e-6  # no shift at all
 
 @dataclass(frozen=True)
 class Registered:
-    """What registration found, a value a view; lengths in pixels of the full-resolution panel.
+    """What registration found, a value a view; lengths in pixels of the full-resolution detector.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def registration_for(
     views, rows, columns = radiographs.shape
     if min(rows, columns) < SMALLEST:
         raise InputError(
-            f"{scan.name}: panel: found {scan.geometry.rows} x {scan.geometry.columns} pixels, "
+            f"{scan.name}: detector: found {scan.geometry.rows} x {scan.geometry.columns} pixels, "
             f"{rows} x {columns} at {level_name(radiographs.level)}, expected at least {SMALLEST} "
             "rows and columns there to register; start at a finer level, such as with schedule 4FR"
         )
@@ -153,7 +153,7 @@ def binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:
 def reprojected(
     stream: Stream, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, stage: str
 ) -> Iterator[tuple[slice, Array, Array]]:
-    """Yield the measured radiographs and their simulated twins, a chunk of views at a time.
+    """Yield the measured radiographs and their simulated counterparts, a chunk of views at a time.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def reproject_and_register(
     registration: Registration | PhaseCorrelation,
     *,
     magnification: Floats,
-    panel: tuple[int, int],
+    detector: tuple[int, int],
     stage: str = "registering",
 ) -> Registered:
     """Run steps 3 and 4 of Algorithm 1.
@@ -247,7 +247,7 @@ def reproject_and_register(
         Estimator for radiographs of this size.
     magnification : ndarray, (views,)
         That `geometry` has absorbed.
-    panel : (int, int)
+    detector : (int, int)
         As for :func:`in_full_pixels`.
 
     Returns
@@ -258,10 +258,10 @@ def reproject_and_register(
     for views, measured, simulated in reprojected(stream, radiographs, volume, geometry, stage):
         known = magnification[views]
         table[views] = register(stream, registration, measured, simulated, known)
-    return in_full_pixels(table, radiographs.level, panel)
+    return in_full_pixels(table, radiographs.level, detector)
 
 
-def in_full_pixels(table: Floats, level: int, panel: tuple[int, int]) -> Registered:
+def in_full_pixels(table: Floats, level: int, detector: tuple[int, int]) -> Registered:
     """Translate what was registered at a level to full resolution.
 
     Parameters
@@ -270,17 +270,17 @@ def in_full_pixels(table: Floats, level: int, panel: tuple[int, int]) -> Registe
         As of :func:`register`.
     level : int
         Binning factor.
-    panel : (int, int)
-        Rows and columns at full resolution: the magnification is about the binned panel's centre,
-        which lies half of what binning drops away from that of the whole one.
+    detector : (int, int)
+        Rows and columns at full resolution: the magnification is about the binned detector's
+        centre, which lies half of what binning drops away from that of the whole one.
     """
     column = {name: table[:, index] for index, name in enumerate(ESTIMATE_FIELDS)}
     magnification = column["magnification"]
-    aside_v, aside_u = (0.5 * (1 - magnification) * (n % level) for n in panel)
+    offset_v, offset_u = (0.5 * (1 - magnification) * (n % level) for n in detector)
     return Registered(
         motion=Motion(
-            shift_u=level * column["shift_u"] - aside_u,
-            shift_v=level * column["shift_v"] - aside_v,
+            shift_u=level * column["shift_u"] - offset_u,
+            shift_v=level * column["shift_v"] - offset_v,
             magnification=magnification,
         ),
         correlation=column["correlation"],

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Iteration:
-    """One iteration of re-projection alignment; lengths in pixels of the full-resolution panel.
+    """One iteration of re-projection alignment; lengths in pixels of the full-resolution detector.
 
     Attributes
     ----------
@@ -89,12 +89,12 @@ class AlignmentResult:
     Attributes
     ----------
     motion : Motion
-        Of each view, in pixels of the full-resolution panel; mean(log magnification) = 0.
+        Of each view, in pixels of the full-resolution detector; mean(log magnification) = 0.
     history : list of Iteration
         One entry an iteration.
     confidence : ndarray, (views,)
-        Correlation of each measured radiograph with its simulated twin in the band used, clipped to
-        0..1, after the last registration.
+        Correlation of each measured radiograph with its simulated counterpart in the band used,
+        clipped to 0..1, after the last registration.
     sigma : ndarray, (views, 3)
         Standard errors of shift_u, shift_v [pixel] and magnification, from that registration.
     gauge : dict of str to float
@@ -102,7 +102,7 @@ class AlignmentResult:
         explains. The data hardly see that part; the volume is as sharp with it as without. With
         ``gauge="anchored"`` it is not in `motion` any more.
     flagged : tuple of int
-        Views whose registration is not believed; they have their neighbours' motion.
+        Views whose registration is rejected; they have their neighbours' motion.
     schedule, device : str
         What was run, and on what.
     volume : ndarray of float32, (nz, ny, nx), optional
@@ -125,19 +125,19 @@ class AlignmentResult:
         motion: Motion,
         history: Sequence[Iteration],
         registered: Registered,
-        weak: NDArray[np.bool_],
+        rejected: NDArray[np.bool_],
         gauge: GaugeFit,
         schedule: str,
         device: str,
     ) -> "AlignmentResult":
-        """Sum up what the last registration found; views that are `weak` have no confidence."""
+        """Sum up what the last registration found; views that are `rejected` have no confidence."""
         return cls(
             motion=motion,
             history=list(history),
-            confidence=np.clip(np.where(weak, 0.0, registered.correlation), 0.0, 1.0),
+            confidence=np.clip(np.where(rejected, 0.0, registered.correlation), 0.0, 1.0),
             sigma=registered.sigma,
             gauge=dict(gauge.rms_by_mode),
-            flagged=tuple(int(view) for view in np.flatnonzero(weak)),
+            flagged=tuple(int(view) for view in np.flatnonzero(rejected)),
             schedule=schedule,
             device=device.strip(),
         )

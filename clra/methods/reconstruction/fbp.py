@@ -7,7 +7,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clra.methods.alignment.rejected_views import handed_on
+from clra.methods.alignment.rejected_views import neighbour_weights
 from clra.model.angular_coverage import angle_weights
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -26,7 +26,7 @@ def ramp_fbp(
     geometry: ConeBeamGeometry,
     grid: VolumeGrid,
     *,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     stage: str = "back-projecting",
     volumes: int = 1,
     circle: bool = True,
@@ -52,9 +52,9 @@ def ramp_fbp(
         Of those radiographs, with the motion absorbed.
     grid : VolumeGrid
         Where to reconstruct.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views to reconstruct from, at least one; all by default. The weight of the others goes to
-        those beside them, see :func:`clra.methods.alignment.rejected_views.handed_on`.
+        those beside them, see :func:`clra.methods.alignment.rejected_views.neighbour_weights`.
     stage : str
         What progress reports call this.
     volumes : int
@@ -79,8 +79,8 @@ def ramp_fbp(
     context, queue = stream.context, stream.queue
     row_weight = taper(geometry.rows, FADE)
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
-    chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
-    weight = handed_on(geometry.source, chosen) * angle_weights(geometry)
+    chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
+    weight = neighbour_weights(geometry.source, chosen) * angle_weights(geometry)
     ramp = RampFilter(context, geometry, row_weight=row_weight, view_weight=weight, **memory)
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.alignment.limits import far_motion, lost_features, warned
-from clra.methods.alignment.rejected_views import from_neighbours, odd_radiographs, outliers
+from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered, with_margin
 from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.methods.reconstruction.imgr_level import MultigridLevel
 from clra.methods.reconstruction.imgr_state import (
+    ImgrState,
     MultigridResult,
-    Progressed,
     ReconstructionInterrupted,
     Step,
 )
@@ -55,10 +55,10 @@ def imgr(
     scale: bool = True,
     anchor: bool = True,
     motion: Motion | None = None,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     truth: Motion | None = None,
     osem: OrderedSubsets | None = None,
-    progressed: Progressed | None = None,
+    state: ImgrState | None = None,
 ) -> MultigridResult:
     """Reconstruct from coarse to fine, and align on the way.
 
@@ -71,7 +71,7 @@ def imgr(
     grid : VolumeGrid
         Where to reconstruct, at full resolution.
     levels : str
-        Of a cycle: "QR-HR-FR", or "ER-QR-HR-FR" for large panels; "auto" is the former.
+        Of a cycle: "QR-HR-FR", or "ER-QR-HR-FR" for large detectors; "auto" is the former.
     cycles : int, optional
         Most cycles; by default one without alignment, else until converged, three at most.
     align : bool
@@ -81,13 +81,13 @@ def imgr(
         movement of the sample would explain, see :func:`clra.align`.
     motion : Motion, optional
         Where to start; by default no motion.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views to reconstruct from, all by default; where it aligns it finds out by itself.
     truth : Motion, optional
         To report errors against.
     osem : OrderedSubsets, optional
         How the lowest level is reconstructed.
-    progressed : Progressed, optional
+    state : ImgrState, optional
         Where an interrupted run stopped: it goes on to the last bit as if it had not.
 
     Returns
@@ -115,8 +115,8 @@ def imgr(
     cycles = cycles or (_CYCLES if align else _CYCLES_UNALIGNED)
     start = motion or Motion.identity(scan.views)
     run = _Run(stream, scan, with_margin(grid), factors, align, scale, anchor, osem, truth, start)
-    weak = np.zeros(scan.views, np.bool_) if believed is None else ~believed
-    run.done = progressed or Progressed(None, start, weak)
+    rejected = np.zeros(scan.views, np.bool_) if valid_views is None else ~valid_views
+    run.done = state or ImgrState(None, start, rejected)
     try:
         run.cycles(cycles)
         first = (run.grid.shape[0] - grid.shape[0]) // 2
@@ -143,7 +143,7 @@ class _Run:
     osem: OrderedSubsets
     truth: Motion | None
     start: Motion
-    done: Progressed = field(init=False)
+    done: ImgrState = field(init=False)
     registered: Registered | None = field(init=False, default=None)
     found: Motion = field(init=False)  # by the last registration, with its gauge
 
@@ -164,7 +164,7 @@ class _Run:
             ended = last and (cycle + 1 == most or self._converged(done))
             self.done = replace(done, ended=ended)
 
-    def _correct(self, level: MultigridLevel, cycle: int, title: str) -> Progressed:
+    def _correct(self, level: MultigridLevel, cycle: int, title: str) -> ImgrState:
         """One resolution of a cycle: steps 4 to 9, 10 to 15, or 16 to 21."""
         started = time.perf_counter()
         before = self.done.motion
@@ -180,25 +180,25 @@ class _Run:
             title=title,
         )
         # 7, 14, 20: transform, by absorbing the motion in the geometry
-        motion, weak = (before, self.done.weak) if found is None else self._moved(found)
+        motion, rejected = (before, self.done.rejected) if found is None else self._moved(found)
         shape = self.scan.geometry.shape
         moved = between(before, motion, shape, level.factor) if self.align else None
         # 15, 21: calculate the update, back-project and filter
         update = level.correction(
-            simulated, motion, volume.grid, moved=moved, believed=~weak, title=title
+            simulated, motion, volume.grid, moved=moved, valid_views=~rejected, title=title
         )
         del simulated
         add_update(self.stream, volume, update, sampled(level.geometry(motion), volume.grid))
         del update
         if level.lowest:
             # 9: OSEM-TR
-            level.reconstruct(volume, motion, ~weak, title)
+            level.reconstruct(volume, motion, ~rejected, title)
         step = Step(cycle, level_name(level.factor), misfit, time.perf_counter() - started)
         self.stream.report(f"{title}: misfit {misfit:.4g} before", 1, 1)
-        return Progressed(
+        return ImgrState(
             volume,
             motion,
-            weak,
+            rejected,
             (*self.done.steps, step),
             self.done.history if found is None else self._history(step, motion, found, level),
         )
@@ -208,17 +208,17 @@ class _Run:
         if self.done.volume is not None:
             return level.brought(self.done.volume)
         if self.align:
-            odd = odd_radiographs(self.stream, level.radiographs)
-            self.done = replace(self.done, weak=odd)
-        return level.first(self.done.motion, ~self.done.weak)
+            odd = unusable_radiographs(self.stream, level.radiographs)
+            self.done = replace(self.done, rejected=odd)
+        return level.first(self.done.motion, ~self.done.rejected)
 
     def _moved(self, found: Registered) -> tuple[Motion, NDArray[np.bool_]]:
-        """Append what was found to the motion; also which views are not believed."""
-        self.registered, weak = found, outliers(found.correlation)
-        self.found = from_neighbours(self.done.motion.then(found.motion), weak)
+        """Append what was found to the motion; also which views are rejected."""
+        self.registered, rejected = found, outliers(found.correlation)
+        self.found = from_neighbours(self.done.motion.then(found.motion), rejected)
         gauge, start = self.shift_gauge, self.start
         motion = gauge.anchored(self.found, start) if self.anchor else self.found
-        return motion.normalised(), weak
+        return motion.normalised(), rejected
 
     def _history(
         self, step: Step, motion: Motion, found: Registered, level: MultigridLevel
@@ -244,7 +244,7 @@ class _Run:
         )
         return (*self.done.history, iteration)
 
-    def _converged(self, done: Progressed) -> bool:
+    def _converged(self, done: ImgrState) -> bool:
         """Tell whether another cycle is worth nothing."""
         before, after = self.done.motion, done.motion
         count = len(self.factors)
@@ -264,7 +264,7 @@ class _Run:
             self.done.motion,
             self.done.history,
             self.registered,
-            self.done.weak,
+            self.done.rejected,
             self.gauge.fit(self.found),
             "-".join(map(level_name, self.factors)),
             self.stream.device.name,

@@ -79,7 +79,7 @@ class MultigridLevel:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Pixels of the binned panel that count."""
+        """Pixels of the binned detector that count."""
         mask = self.scan.mask
         return binned_mask(
             np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask, self.factor
@@ -89,7 +89,7 @@ class MultigridLevel:
         """Motions are in full-resolution pixels: absorb first, then bin."""
         return self.scan.geometry.with_motion(motion).binned(self.factor)
 
-    def first(self, motion: Motion, believed: Believed) -> Volume:
+    def first(self, motion: Motion, valid_views: Believed) -> Volume:
         """Return the volume to start from: steps 1 and 2."""
         return start_volume(
             self.stream,
@@ -97,7 +97,7 @@ class MultigridLevel:
             self.geometry(motion),
             self.grid,
             self.osem,
-            believed=believed,
+            valid_views=valid_views,
         )
 
     def brought(self, volume: Volume) -> Volume:
@@ -174,7 +174,7 @@ class MultigridLevel:
         grid: VolumeGrid,
         *,
         moved: Floats | None,
-        believed: Believed,
+        valid_views: Believed,
         title: str,
     ) -> Volume:
         """Filter and back-project what the radiographs hold beyond simulated ones: steps 15, 21.
@@ -189,7 +189,7 @@ class MultigridLevel:
             Of the volume to be corrected.
         moved : ndarray, (views, 3), optional
             As for :func:`clra.methods.reconstruction.residuals.residuals`.
-        believed : ndarray of bool, (views,)
+        valid_views : ndarray of bool, (views,)
             Views to correct by, at least one.
         title : str
             What progress reports begin with.
@@ -199,12 +199,14 @@ class MultigridLevel:
             residuals(self.stream, self.radiographs, simulated, self.used, moved=moved),
             self.geometry(motion),
             grid,
-            believed=believed,
+            valid_views=valid_views,
             stage=f"{title}: correcting",
             volumes=self.volumes,
         )
 
-    def reconstruct(self, volume: Volume, motion: Motion, believed: Believed, title: str) -> None:
+    def reconstruct(
+        self, volume: Volume, motion: Motion, valid_views: Believed, title: str
+    ) -> None:
         """Raise the likelihood of the volume by OSEM-TR: step 9."""
         osem_tr(
             self.stream,
@@ -213,6 +215,6 @@ class MultigridLevel:
             volume,
             self.osem,
             used=self.used,
-            believed=believed,
+            valid_views=valid_views,
             stage=f"{title}: OSEM-TR",
         )

@@ -33,7 +33,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Progressed:
+class ImgrState:
     """What the levels finished so far gave: all that the next one needs.
 
     Attributes
@@ -42,8 +42,8 @@ class Progressed:
         At the resolution of the last level, on the grid with its margin.
     motion : Motion
         Of the radiographs.
-    weak : ndarray of bool, (views,)
-        Radiographs that are not believed; they are left out.
+    rejected : ndarray of bool, (views,)
+        Radiographs that are rejected; they are left out.
     steps : tuple of Step
         Finished ones.
     history : tuple of Iteration
@@ -54,7 +54,7 @@ class Progressed:
 
     volume: Volume | None
     motion: Motion
-    weak: NDArray[np.bool_]
+    rejected: NDArray[np.bool_]
     steps: tuple[Step, ...] = ()
     history: tuple[Iteration, ...] = ()
     ended: bool = False
@@ -65,15 +65,15 @@ class ReconstructionInterrupted(KeyboardInterrupt):
 
     Attributes
     ----------
-    progressed : Progressed
+    state : ImgrState
         To go on from.
     alignment : AlignmentResult or None
         What the finished levels gave, where they aligned.
     """
 
-    def __init__(self, progressed: Progressed, alignment: AlignmentResult | None) -> None:
+    def __init__(self, state: ImgrState, alignment: AlignmentResult | None) -> None:
         super().__init__("reconstruction was interrupted")
-        self.progressed = progressed
+        self.state = state
         self.alignment = alignment
 
 

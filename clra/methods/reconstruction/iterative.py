@@ -30,7 +30,7 @@ def iterate(
     grid: VolumeGrid,
     motion: Motion | None,
     align: bool,
-    believed: NDArray[np.bool_] | None,
+    valid_views: NDArray[np.bool_] | None,
     options: Mapping[str, Any],
 ) -> None:
     """Reconstruct, and hand the volume on some planes at a time.
@@ -51,7 +51,7 @@ def iterate(
         Of the radiographs.
     align : bool
         Whether "imgr" aligns on the way.
-    believed : ndarray of bool or None, (views,)
+    valid_views : ndarray of bool or None, (views,)
         Views to reconstruct from; "imgr" finds out by itself where it aligns.
     options : mapping
         As :func:`sorted_options` takes them.
@@ -63,16 +63,16 @@ def iterate(
     """
     osem, cycle = sorted_options(method, options)
     if method == "imgr":
-        cycle |= {"align": align, "motion": motion, "believed": believed}
+        cycle |= {"align": align, "motion": motion, "valid_views": valid_views}
         found = imgr(stream, scan, grid, osem=osem, **cycle)
         found.volume.write(target)
         return
     geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
     radiographs, wide = Radiographs(stream, scan, 1), with_margin(grid)
     osem = _widened(osem, grid, wide)
-    volume = start_volume(stream, radiographs, geometry, wide, osem, believed=believed)
+    volume = start_volume(stream, radiographs, geometry, wide, osem, valid_views=valid_views)
     used = np.ones(geometry.shape, np.bool_) if scan.mask is None else scan.mask
-    osem_tr(stream, radiographs, geometry, volume, osem, used=used, believed=believed)
+    osem_tr(stream, radiographs, geometry, volume, osem, used=used, valid_views=valid_views)
     cropped(stream, volume, (wide.shape[0] - grid.shape[0]) // 2, grid).write(target)
 
 

@@ -36,7 +36,7 @@ def katsevich(
 ) -> Volume:
     """Reconstruct exactly from helical radiographs.
 
-    Katsevich's inversion [1]_ for flat panels, by the five steps of [2]_. Several helices that
+    Katsevich's inversion [1]_ for flat detectors, by the five steps of [2]_. Several helices that
     follow each other, such as a double helix, are reconstructed each by itself and averaged where
     more than one of them holds all views of a voxel that the formula needs. Voxels of which no
     helix does, at the ends of the scan and outside the circle that all views see, are 0.
@@ -48,8 +48,8 @@ def katsevich(
     radiographs : Radiographs
         Line integrals at the resolution of `geometry`, free of motion.
     geometry : ConeBeamGeometry
-        Of those radiographs: helices about z, upright panels that face the axis. Start, sense and
-        pitch are free, and so is where on the panel the axis is seen.
+        Of those radiographs: helices about z, upright detectors that face the axis. Start, sense
+        and pitch are free, and so is where on the detector the axis is seen.
     grid : VolumeGrid
         Where to reconstruct.
     stage : str
@@ -67,9 +67,9 @@ def katsevich(
     Raises
     ------
     InputError
-        If the trajectory is no helix, the panel shorter than the Tam-Danielsson window, the sample
-        wider than the field of view, or the helix too short for any of the grid; the message says
-        what would do.
+        If the trajectory is no helix, the detector shorter than the Tam-Danielsson window, the
+        sample wider than the field of view, or the helix too short for any of the grid; the message
+        says what would do.
 
     References
     ----------

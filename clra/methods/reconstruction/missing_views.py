@@ -1,4 +1,4 @@
-"""Views that Katsevich's method needs and a scan lacks, or that are not to be believed."""
+"""Views that Katsevich's method needs and a scan lacks, or that are rejected."""
 
 from collections.abc import Iterable
 
@@ -13,14 +13,14 @@ from clra.model.scan import Scan
 Views = NDArray[np.int64]
 
 
-def without_gaps(scan: Scan, believed: NDArray[np.bool_] | None = None) -> Scan:
+def without_gaps(scan: Scan, valid_views: NDArray[np.bool_] | None = None) -> Scan:
     """Put what lies between the views beside it in place of each view that helices lack.
 
     Parameters
     ----------
     scan : Scan
         Along one or more helices, free of motion.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views to keep, all by default.
 
     Returns
@@ -33,12 +33,12 @@ def without_gaps(scan: Scan, believed: NDArray[np.bool_] | None = None) -> Scan:
     Raises
     ------
     InputError
-        If the trajectory is no helix, or no view of one of several is believed.
+        If the trajectory is no helix, or no view of one of several is valid.
     """
     geometry, views = completed(scan.geometry)
     helices = [part for part, _ in fit_helices(geometry)]
-    if believed is not None:
-        views = np.where((views >= 0) & believed[views], views, -1)
+    if valid_views is not None:
+        views = np.where((views >= 0) & valid_views[views], views, -1)
     if np.array_equal(views, np.arange(scan.views)):
         return scan
     return Scan(_Filled(scan, views, helices), geometry, name=scan.name, mask=scan.mask)
@@ -68,8 +68,8 @@ class _Filled:
             kept = here[views[part] >= 0]
             if not len(kept):
                 raise InputError(
-                    f"believed: found none of the views {part.start} to {part.stop - 1}, expected "
-                    "at least one of each helix"
+                    f"valid_views: found none of the views {part.start} to {part.stop - 1}, "
+                    "expected at least one of each helix"
                 )
             for view in here[views[part] < 0]:
                 after = int(np.searchsorted(kept, view))

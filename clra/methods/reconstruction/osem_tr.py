@@ -112,7 +112,7 @@ def osem_tr(
     options: OrderedSubsets,
     *,
     used: NDArray[np.bool_],
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     stage: str = "OSEM-TR",
 ) -> list[float]:
     """Raise the likelihood of a volume, one subset of the views after the other.
@@ -130,8 +130,8 @@ def osem_tr(
     options : OrderedSubsets
         How to go about it; `initial` is `volume`.
     used : ndarray of bool, (rows, columns)
-        Pixels of the panel that count.
-    believed : ndarray of bool, (views,), optional
+        Pixels of the detector that count.
+    valid_views : ndarray of bool, (views,), optional
         Views to reconstruct from, at least one; all by default.
     stage : str
         What progress reports call this.
@@ -141,7 +141,7 @@ def osem_tr(
     list of float
         Misfit of each pass: mean Poisson deviance of a ray, as each subset met the volume.
     """
-    chosen = np.ones(geometry.views, np.bool_) if believed is None else believed
+    chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
     rays = _Rays(stream, radiographs, geometry, volume, options, used, np.flatnonzero(chosen))
     step = VolumeStep(stream.context)
     precomputed = options.update == "paraboloid"
@@ -186,7 +186,7 @@ def start_volume(
     grid: VolumeGrid,
     options: OrderedSubsets,
     *,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
 ) -> Volume:
     """Make the volume that :func:`osem_tr` starts from, as the options say.
 
@@ -202,7 +202,9 @@ def start_volume(
     if not isinstance(options.initial, str):
         given = volume_from(stream, grid, options.initial, volumes=VOLUMES)
     elif options.initial == "fbp":
-        given = ramp_fbp(stream, radiographs, geometry, grid, believed=believed, volumes=VOLUMES)
+        given = ramp_fbp(
+            stream, radiographs, geometry, grid, valid_views=valid_views, volumes=VOLUMES
+        )
     else:
         mean = _mean_attenuation(stream, radiographs, geometry, volume)
         given = constant_volume(stream, grid, mean, volumes=VOLUMES)

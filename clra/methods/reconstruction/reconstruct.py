@@ -40,7 +40,7 @@ def reconstruct(
     align: bool = False,
     device: Any = None,
     *,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
@@ -69,7 +69,7 @@ def reconstruct(
     device : str or cl.Device, optional
         As `choose_device` takes it, or "all" to share the work out to all
         devices of the best kind; alignment and iterative methods take the first of them.
-    believed : ndarray of bool, (views,), optional
+    valid_views : ndarray of bool, (views,), optional
         Views to reconstruct from, such as ``result.confidence > 0``; all by default, with `align`
         those that are not flagged. "katsevich" needs every view: what lies between the radiographs
         beside stands in for the others, and for views that the scan lacks.
@@ -91,9 +91,9 @@ def reconstruct(
     Raises
     ------
     InputError
-        If the method or an option of it is unknown, no view is believed, both `motion` and `align`
-        are given, or the scan is one that Katsevich's method cannot treat; says what pitch, panel
-        or field of view would do.
+        If the method or an option of it is unknown, no view is valid_views, both `motion` and
+        `align` are given, or the scan is one that Katsevich's method cannot treat; says what pitch,
+        detector or field of view would do.
     """
     planes = HostPlanes(grid or default_grid(scan.cropped().geometry))
     reconstruct_into(
@@ -104,7 +104,7 @@ def reconstruct(
         motion,
         align,
         device,
-        believed=believed,
+        valid_views=valid_views,
         progress=progress,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
@@ -122,7 +122,7 @@ def reconstruct_into(
     align: bool = False,
     device: Any = None,
     *,
-    believed: NDArray[np.bool_] | None = None,
+    valid_views: NDArray[np.bool_] | None = None,
     progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
@@ -135,7 +135,7 @@ def reconstruct_into(
     target : PlaneWriter
         Takes the planes, each once; `open_volume` gives one that writes a
         file.
-    scan, method, grid, motion, align, device, believed, progress, max_device_memory, \
+    scan, method, grid, motion, align, device, valid_views, progress, max_device_memory, \
     max_host_memory, options
         As :func:`reconstruct` takes them.
 
@@ -148,10 +148,10 @@ def reconstruct_into(
         raise InputError(f"method: found {method!r}, expected one of {METHODS}")
     if align and motion is not None:
         raise InputError("motion and align: found both, expected one of them")
-    if believed is not None:
-        believed = believed_views(believed, scan.views)
+    if valid_views is not None:
+        valid_views = believed_views(valid_views, scan.views)
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
-    motion = None if motion is None else motion.about(*scan.window_aside)
+    motion = None if motion is None else motion.about(*scan.window_offset)
     scan = scan.cropped()
     grid = grid or default_grid(scan.geometry)
     devices = usable_devices(device, progress)
@@ -163,14 +163,14 @@ def reconstruct_into(
     fitted: Exact | None = None
     if method == "katsevich":
         # What it cannot treat it refuses before the long work.
-        whole = without_gaps(scan, believed)
+        whole = without_gaps(scan, valid_views)
         fitted = exact_helices(Radiographs(stream, whole, 1), whole.geometry, grid)
     if align and method != "imgr":
         aligned = align_scan(scan, device=devices[0], progress=progress, **limits)
         motion = aligned.motion
-        believed = all_but(aligned.flagged, scan.views)
+        valid_views = all_but(aligned.flagged, scan.views)
     if fitted is not None:
-        _warn_of_gaps(fitted, grid, scan.views if believed is None else int(believed.sum()))
+        _warn_of_gaps(fitted, grid, scan.views if valid_views is None else int(valid_views.sum()))
     notes = []
     if method == "fbp":
         notes = [part_of_a_turn(scan.geometry), steep_rows(scan.geometry)]
@@ -179,13 +179,13 @@ def reconstruct_into(
     for note in filter(None, notes):
         warnings.warn(note, stacklevel=2)
     if method in iterative.METHODS:
-        iterative.iterate(stream, target, scan, method, grid, motion, align, believed, options)
+        iterative.iterate(stream, target, scan, method, grid, motion, align, valid_views, options)
         return
 
     def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
         if fitted is not None:
             ideal = scan if motion is None else corrected(stream, scan, motion)
-            whole = without_gaps(ideal, believed)
+            whole = without_gaps(ideal, valid_views)
             radiographs = Radiographs(stream, whole, 1)
             part = grid.slab(planes.start, planes.stop)
             katsevich(stream, radiographs, whole.geometry, part, fitted=fitted, target=target)
@@ -197,7 +197,7 @@ def reconstruct_into(
                 radiographs,
                 geometry,
                 grid,
-                believed=believed,
+                valid_views=valid_views,
                 planes=planes,
                 target=target,
             )
@@ -214,8 +214,8 @@ def _warn_of_gaps(fitted: Exact, grid: VolumeGrid, there: int) -> None:
     needed = sum(views.stop - views.start for views, _ in helical)
     if there < needed:
         warnings.warn(
-            f"katsevich needs every view: {needed - there} of {needed} that are missing or not "
-            "believed are interpolated from those beside",
+            f"katsevich needs every view: {needed - there} of {needed} that are missing or "
+            "rejected are interpolated from their neighbours",
             stacklevel=3,
         )
     between = heights_between([helix for _, helix in helical], grid)

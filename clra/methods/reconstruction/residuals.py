@@ -19,9 +19,9 @@ def between(before: Motion, after: Motion, shape: tuple[int, int], level: int) -
     Parameters
     ----------
     before, after : Motion
-        In pixels of the full-resolution panel.
+        In pixels of the full-resolution detector.
     shape : (int, int)
-        Rows and columns of that panel.
+        Rows and columns of that detector.
     level : int
         Binning factor of the radiographs.
 
@@ -29,7 +29,7 @@ def between(before: Motion, after: Motion, shape: tuple[int, int], level: int) -
     -------
     ndarray, (views, 3)
         Shifts along columns and rows [pixel of the level], and magnification, about the centre of
-        the binned panel, which lies half of what binning drops away from that of the whole one.
+        the binned detector, which lies half of what binning drops away from that of the whole one.
     """
     grown = after.magnification / before.magnification
     lost_v, lost_u = (0.5 * (grown - 1) * (n % level) for n in shape)
@@ -61,8 +61,9 @@ def residuals(
     moved : ndarray, (views, 3), optional
         By what features of the simulated radiographs lie elsewhere in the measured ones, as of
         :func:`between`. The simulated one is resampled to lie there too: a shift and a
-        magnification of the panel leave rays as they are, so that but for the interpolation, by
-        splines in an image without noise, it is what a projection with the panel moved would give.
+        magnification of the detector leave rays as they are, so that but for the interpolation, by
+        splines in an image without noise, it is what a projection with the detector moved would
+        give.
 
     Returns
     -------

@@ -28,8 +28,8 @@ Floats = NDArray[np.float64]
 _COMMON = 0.05
 
 # Part of a movement's displacement that shifts have to imitate for it to count as gauge. Helices: a
-# translation 0.7 to 1, a tilt or stretch of a sample many panels high 0.5 to 0.9. A circle, whose
-# views see all of the sample: a tilt or stretch below 0.1, and there the data see it well.
+# translation 0.7 to 1, a tilt or stretch of a sample many detectors high 0.5 to 0.9. A circle,
+# whose views see all of the sample: a tilt or stretch below 0.1, and there the data see it well.
 _IMITATED = 0.25
 
 # Robust standard deviations beyond which a view's shift does not count when the gauge is taken out:
@@ -95,7 +95,7 @@ class Gauge:
         Points of the sample, as of `sample_points` [mm].
     magnification : bool
         Whether magnification is estimated. If so, it is part of the fit, weighted as the
-        displacement in pixels at half the panel's half diagonal, and scale is a mode; if not,
+        displacement in pixels at half the detector's half diagonal, and scale is a mode; if not,
         both are left out.
     """
 
@@ -115,7 +115,7 @@ class Gauge:
         self._design = _rows(columns * imitated, self._weight)
 
     def _sizes(self, geometry: ConeBeamGeometry, points: Floats) -> Floats:
-        """RMS displacement of the points on the panel for a unit of each mode [pixel]."""
+        """RMS displacement of the points on the detector for a unit of each mode [pixel]."""
         pixel = np.linalg.norm(geometry.u, axis=1) * geometry.source_to_axis
         per_mm = float(np.median(geometry.source_to_detector / pixel))
         fields = (mode_field(mode, points) for mode in self.modes)
@@ -194,7 +194,7 @@ class Gauge:
         table[:, used] -= part / self._weight[used]
         return table
 
-    def error(self, estimate: Motion, truth: Motion) -> MotionError:
+    def error(self, estimate: Motion, truth: Motion) -> MotionDifference:
         """Compare an estimated motion with the true one, raw and gauge-free.
 
         Parameters
@@ -216,7 +216,7 @@ class Gauge:
         )
         free = np.abs(self.fit(difference).remainder)
         raw = np.abs(_table(difference))
-        return MotionError(
+        return MotionDifference(
             *raw.mean(axis=0).tolist(),
             *raw.std(axis=0).tolist(),
             *free.mean(axis=0).tolist(),
@@ -258,7 +258,7 @@ def _table(motion: Motion) -> Floats:
 
 
 @dataclass(frozen=True)
-class MotionError:
+class MotionDifference:
     """How far an estimated motion is from the truth.
 
     Attributes

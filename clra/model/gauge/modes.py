@@ -56,7 +56,7 @@ def gauge_columns(
     points = vectors("points", points, "points")
     fields = np.concatenate([mode_field(mode, points) for mode in modes], axis=1)
     to_pixels = geometry.projection_matrices()[:, :, :3].copy()
-    # Pixels are counted from the panel's centre here, about which it is magnified.
+    # Pixels are counted from the detector's centre here, about which it is magnified.
     to_pixels[:, 0] -= (geometry.columns - 1) / 2 * to_pixels[:, 2]
     to_pixels[:, 1] -= (geometry.rows - 1) / 2 * to_pixels[:, 2]
     columns = np.zeros((3, geometry.views, len(modes)))

@@ -11,8 +11,8 @@ from clra.model.helix.helix import Helix
 
 Floats = NDArray[np.float64]
 
-# Pixels by which the shadow of a point may lie off its place on a fitted helix. A tenth is below
-# what alignment resolves; ten times as much shows as a double edge.
+# Pixels by which the projection of a point may lie off its place on a fitted helix. A tenth is
+# below what alignment resolves; ten times as much shows as a double edge.
 TOLERANCE = 0.1
 
 # Largest angle from view to view [rad]. The derivative along the helix is a difference of
@@ -36,7 +36,7 @@ def fit_helices(geometry: ConeBeamGeometry) -> list[tuple[slice, Helix]]:
     Raises
     ------
     InputError
-        If the views are not those of helices about z with an upright panel that faces the axis,
+        If the views are not those of helices about z with an upright detector that faces the axis,
         to a tenth of a pixel.
     """
     x, y, z = geometry.source.T
@@ -99,15 +99,15 @@ def _fit(geometry: ConeBeamGeometry, first: int) -> Helix:
     )
     if helix.pitch_u == 0 or helix.pitch_v == 0:
         raise InputError(
-            "trajectory: found a panel turned on its side, expected columns parallel to z"
+            "trajectory: found a detector turned on its side, expected columns parallel to z"
         )
     apart = _distance(geometry, helix)
     worst = int(apart.argmax())
     if not apart[worst] <= TOLERANCE:
         raise InputError(
             f"trajectory: view {first + worst} is {apart[worst]:.3g} pixels off the best helix, "
-            f"expected at most {TOLERANCE}: a panel that faces the axis and equal steps in angle "
-            "and height; use method 'fbp'"
+            f"expected at most {TOLERANCE}: a detector that faces the axis and equal steps in "
+            "angle and height; use method 'fbp'"
         )
     return helix
 

@@ -1,6 +1,6 @@
-"""Helical trajectories: fitted to a scan, and the curves on their panel that exact methods use.
+"""Helical trajectories: fitted to a scan, and the curves on their detector that exact methods use.
 
-Angles, lines and windows are those of Noo, Pack and Heuscher [1]_. A position on the panel is
+Angles, lines and windows are those of Noo, Pack and Heuscher [1]_. A position on the detector is
 written as tangents, t_u along the rows and t_v along z, of the angle to the normal. The helix rises
 by ``slope = rise / source_to_axis`` radii a radian; a negative slope mirrors all along z, so that
 the formulas hold for both hands.
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Helix:
-    """Views along a helix about z, their panel upright and facing the axis.
+    """Views along a helix about z, their detector upright and facing the axis.
 
     View i is at the angle ``start + i angle_step``, b, and the height ``z + i z_step``; its source
     is at ``source_to_axis (sin b, -cos b)``.
@@ -44,7 +44,7 @@ class Helix:
     pitch_u, pitch_v : float
         From column to column along (cos b, sin b, 0), from row to row along z; signed [mm].
     shape : (int, int)
-        Rows and columns of the panel.
+        Rows and columns of the detector.
     """
 
     views: int
@@ -85,12 +85,12 @@ class Helix:
         )
 
     def cropped(self, first: int, last: int) -> Helix:
-        """Return the same views with only the rows `first` to `last - 1` of the panel."""
+        """Return the same views with only the rows `first` to `last - 1` of the detector."""
         column, row = self.principal
         return replace(self, principal=(column, row - first), shape=(last - first, self.shape[1]))
 
     def geometry(self) -> ConeBeamGeometry:
-        """Return source and panel of every view."""
+        """Return source and detector of every view."""
         index = np.arange(self.views)
         angle, z = self.start + index * self.angle_step, self.z + index * self.z_step
         zero = np.zeros_like(angle)
@@ -117,8 +117,8 @@ class Helix:
     def window(self, tangent_u: ArrayLike) -> tuple[Floats, Floats]:
         """Tangents t_v of the two borders of the Tam-Danielsson window.
 
-        A point's shadow is between them while the source runs along its pi-interval: they are the
-        shadows of the turns of the helix next to the source, the one ahead first.
+        A point's projection is between them while the source runs along its pi-interval: they are
+        the projections of the turns of the helix next to the source, the one ahead first.
         """
         t = np.asarray(tangent_u, np.float64)
         scale = self.slope * (1 + t * t)
@@ -127,7 +127,7 @@ class Helix:
     def kappa_line(self, psi: ArrayLike) -> tuple[Floats, Floats]:
         """Filter line of the angle psi [rad]: t_v = first + second * t_u.
 
-        It is the shadow of a plane that meets the helix at the source, psi and 2 psi ahead.
+        It is the projection of a plane that meets the helix at the source, psi and 2 psi ahead.
         """
         psi = np.asarray(psi, np.float64)
         safe = np.where(np.abs(psi) < 1e-6, 1e-6, psi)
@@ -150,7 +150,7 @@ class Helix:
         return float(rows.min()), float(rows.max())
 
     def window_rows(self, radius: float) -> tuple[int, int]:
-        """First row of the panel that the window needs, and the row behind the last.
+        """First row of the detector that the window needs, and the row behind the last.
 
         With what softens its borders, see `PiBackProjector`.
         """
@@ -162,7 +162,7 @@ class Helix:
         return first, min(self.shape[0], math.ceil(rows.max() + soft) + 1)
 
     def pi_heights(self, view: int, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats, Floats]:
-        """Heights at (x, y) whose shadow in a view lies on the borders of the window.
+        """Heights at (x, y) whose projection in a view lies on the borders of the window.
 
         Parameters
         ----------
@@ -176,7 +176,7 @@ class Helix:
         ahead, behind : ndarray
             Heights on the border ahead of the source and on that behind [mm].
         depth : ndarray
-            Of the positions as a fraction of the panel's.
+            Of the positions as a fraction of the detector's.
         """
         angle = self.start + view * self.angle_step
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)

@@ -32,8 +32,8 @@ def field_of_view(helices: Sequence[Helix], grid: VolumeGrid) -> float:
     helices : sequence of Helix
         Of the scan.
     grid : VolumeGrid
-        Of the volume wanted. Where the panel is too short for the whole field of view, the sample
-        has to lie inside the circle that fits into this grid.
+        Of the volume wanted. Where the detector is too short for the whole field of view, the
+        sample has to lie inside the circle that fits into this grid.
 
     Returns
     -------
@@ -43,8 +43,8 @@ def field_of_view(helices: Sequence[Helix], grid: VolumeGrid) -> float:
     Raises
     ------
     InputError
-        If a panel does not see the axis, is shorter than the Tam-Danielsson window, or has too few
-        rows in it; says what rows, pitch or field of view would do.
+        If a detector does not see the axis, is shorter than the Tam-Danielsson window, or has too
+        few rows in it; says what rows, pitch or field of view would do.
     """
     return min(_field_of_view(helix, grid) for helix in helices)
 
@@ -53,7 +53,7 @@ def _field_of_view(helix: Helix, grid: VolumeGrid) -> float:
     seen = helix.field_radius
     if not seen > 0:
         raise InputError(
-            "panel: it does not see the rotation axis, expected a field of view about the axis"
+            "detector: it does not see the rotation axis, expected a field of view about the axis"
         )
     borders = helix.row(np.stack(helix.window(0.0)))
     window = float(np.ptp(borders))
@@ -81,8 +81,8 @@ def _field_of_view(helix: Helix, grid: VolumeGrid) -> float:
             f"a field of view of at most {2 * possible[-1]:.4g} mm (found {2 * radius:.4g})"
         )
     raise InputError(
-        f"panel: rows 0 to {helix.shape[0] - 1} are less than the Tam-Danielsson window, expected "
-        f"{' or '.join(advice)}; or use method 'fbp'"
+        f"detector: rows 0 to {helix.shape[0] - 1} are less than the Tam-Danielsson window, "
+        f"expected {' or '.join(advice)}; or use method 'fbp'"
     )
 
 

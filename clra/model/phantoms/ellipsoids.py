@@ -85,13 +85,13 @@ class Ellipsoids:
     ) -> NDArray[np.float32]:
         """Integrate the attenuation along the rays to the pixels.
 
-        Only the pixels in each shadow's bounding box are touched, so that hundreds of small
+        Only the pixels in each projection's bounding box are touched, so that hundreds of small
         ellipsoids are quick.
 
         Parameters
         ----------
         geometry : ConeBeamGeometry
-            Where source and panel stood. A ray is the whole line through source and pixel.
+            Where source and detector stood. A ray is the whole line through source and pixel.
         start, stop : int
             Range of views; all of them if not given.
         oversample : int
@@ -105,7 +105,7 @@ class Ellipsoids:
         Raises
         ------
         InputError
-            If an ellipsoid reaches the plane through a source parallel to its panel.
+            If an ellipsoid reaches the plane through a source parallel to its detector.
         """
         oversample = whole("oversample", oversample)
         chosen = geometry.subset(slice(start, stop))
@@ -114,14 +114,14 @@ class Ellipsoids:
         for view in range(chosen.views):
             image = np.zeros(chosen.shape)
             centres = self.centres - chosen.source[view]
-            shadow, boxes = self._shadows(matrices[view], centres, chosen.shape)
+            projection, boxes = self._shadows(matrices[view], centres, chosen.shape)
             hit, scaled, length = _quadratics(
-                centres, shadow[:, 2], chosen.u[view], chosen.v[view], self.semi_axes
+                centres, projection[:, 2], chosen.u[view], chosen.v[view], self.semi_axes
             )
             for n in np.flatnonzero((boxes[:, 1] > boxes[:, 0]).all(axis=1)):
                 (i0, j0), (i1, j1) = boxes[n]
-                column = _fine(i0, i1, oversample) - shadow[n, 0]
-                row = _fine(j0, j1, oversample)[:, None] - shadow[n, 1]
+                column = _fine(i0, i1, oversample) - projection[n, 0]
+                row = _fine(j0, j1, oversample)[:, None] - projection[n, 1]
                 chords = _chords(column, row, hit[n], scaled[n], length[n])
                 if oversample > 1:
                     blocks = chords.reshape(j1 - j0, oversample, i1 - i0, oversample)
@@ -137,23 +137,23 @@ class Ellipsoids:
 
         The bounds are those of the image of the dual quadric, taken about the image of the centre.
         """
-        shadow = centres @ to_pixels.T
+        projection = centres @ to_pixels.T
         with np.errstate(divide="ignore", invalid="ignore"):
-            shadow[:, :2] /= shadow[:, 2:]
+            projection[:, :2] /= projection[:, 2:]
         depth_axes = to_pixels[2] * self.semi_axes
-        clear = shadow[:, 2] ** 2 - np.sum(depth_axes**2, axis=1)
-        if (shadow[:, 2] <= 0).any() or (clear <= 0).any():
+        clear = projection[:, 2] ** 2 - np.sum(depth_axes**2, axis=1)
+        if (projection[:, 2] <= 0).any() or (clear <= 0).any():
             raise InputError("an ellipsoid reaches the plane of a source: move it or the source")
         boxes = np.empty((len(self), 2, 2), dtype=np.int_)
         for k, size in enumerate(shape[::-1]):
-            axes = (to_pixels[k] - shadow[:, k, None] * to_pixels[2]) * self.semi_axes
+            axes = (to_pixels[k] - projection[:, k, None] * to_pixels[2]) * self.semi_axes
             middle = -np.sum(axes * depth_axes, axis=1)
             spread = np.sqrt(middle**2 + clear * np.sum(axes**2, axis=1))
-            low = shadow[:, k] + (middle - spread) / clear
-            high = shadow[:, k] + (middle + spread) / clear
+            low = projection[:, k] + (middle - spread) / clear
+            high = projection[:, k] + (middle + spread) / clear
             boxes[:, 0, k] = np.clip(np.floor(low + 0.5), 0, size)
             boxes[:, 1, k] = np.clip(np.floor(high + 0.5) + 1, 0, size)
-        return shadow, boxes
+        return projection, boxes
 
     def volume(self, grid: VolumeGrid, *, oversample: int = 2) -> NDArray[np.float32]:
         """Average the attenuation over each voxel.
@@ -207,10 +207,10 @@ def _quadratics(
 ) -> tuple[Floats, Floats, Floats]:
     """Coefficients, (n, 6), of what `_chords` needs of each ellipsoid in a view.
 
-    centres: from the source [mm], at `depth` of the panel's. The ray to the pixel (column, row),
-    counted from the shadow of a centre, is r = centre / depth + column u + row v. Divided by the
-    semi-axes (primed) it passes the centre of the unit sphere at |centre' x r'| / |r'|, in which
-    centre' x centre' = 0 is left out: nothing cancels, however far the source is.
+    centres: from the source [mm], at `depth` of the detector's. The ray to the pixel (column, row),
+    counted from the projection of a centre, is r = centre / depth + column u + row v. Divided by
+    the semi-axes (primed) it passes the centre of the unit sphere at |centre' x r'| / |r'|, in
+    which centre' x centre' = 0 is left out: nothing cancels, however far the source is.
     """
     o, a, b = centres / axes, u / axes, v / axes
     missed = _square(np.zeros_like(o), np.cross(o, a), np.cross(o, b))

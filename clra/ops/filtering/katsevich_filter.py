@@ -33,7 +33,7 @@ _ANGLES = 4097
 class KatsevichFilter:
     """Filter radiographs along a helix for back-projection over pi-intervals.
 
-    Steps 1 to 4 of Katsevich's formula for flat panels [1]_: the derivative along the helix at
+    Steps 1 to 4 of Katsevich's formula for flat detectors [1]_: the derivative along the helix at
     constant direction with the weight of the ray's length; resampling to kappa lines; the Hilbert
     transform along them; resampling to rows. All is scaled so that
     :class:`clra.ops.projection.pi_backprojector.PiBackProjector` gives attenuation.
@@ -59,7 +59,7 @@ class KatsevichFilter:
         Of the filtered radiographs: views half-way between those given, and only the rows that
         the Tam-Danielsson window needs.
     padded : int
-        Columns of a line in the transforms, at least twice those of the panel.
+        Columns of a line in the transforms, at least twice those of the detector.
     scratch_bytes : int
         Of scratch memory.
 

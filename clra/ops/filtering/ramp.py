@@ -20,7 +20,7 @@ from clra.ops.runtime.lines import lanes
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
 
 # Part of the rows at the top and at the bottom over which a view fades out. Without it the border
-# of each panel leaves an edge in the volume; a tenth smooths it and costs few rays.
+# of each detector leaves an edge in the volume; a tenth smooths it and costs few rays.
 FADE = 0.1
 
 # Bytes of padded lines in work at a time. A CPU wants them in its cache between the steps (2 to 64
@@ -37,7 +37,7 @@ _EXTENSION = 0.2
 
 
 def taper(rows: int, fraction: float) -> NDArray[np.float32]:
-    """Weights of detector rows that fall off towards the top and the bottom of the panel.
+    """Weights of detector rows that fall off towards the top and the bottom of the detector.
 
     They keep the borders of cone-beam data, where views end abruptly, from showing in a
     reconstruction that is divided by the summed weights.
@@ -45,7 +45,7 @@ def taper(rows: int, fraction: float) -> NDArray[np.float32]:
     Parameters
     ----------
     rows : int
-        Rows of the panel.
+        Rows of the detector.
     fraction : float
         Part of the rows, at each end, over which the weight falls as a squared cosine; 0 to 0.5.
 
@@ -71,10 +71,10 @@ class RampFilter:
     """Cosine weight, ramp filter along u, and the scale that back-projection needs.
 
     Of radiographs p of line integrals it makes ``q = R / (SDD |u'|) (p w r) * h`` with R the
-    distance from source to axis, SDD that to the panel, u' what of u is across the way to the axis
-    (all of it, if the panel faces the axis), w SDD over the length of the ray, r the row and view
-    weights, and h the band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd n, 0 for
-    even n. With
+    distance from source to axis, SDD that to the detector, u' what of u is across the way to the
+    axis (all of it, if the detector faces the axis), w SDD over the length of the ray, r the row
+    and view weights, and h the band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd
+    n, 0 for even n. With
     depth fractions g(x) and summed row weights W(x) the attenuation is then
     ``f(x) = pi / W(x) sum_i q_i(x) / g_i(x)^2`` for views around the whole circle. [1]_
 
@@ -92,8 +92,8 @@ class RampFilter:
         What the ramp's spectrum is multiplied by: nothing, a sinc, or a raised cosine that is 0 at
         the Nyquist frequency.
     extend : bool
-        Continue each row past the panel, a fifth of its length on each side, from its outermost
-        value to 0 as a squared cosine: for samples that are wider than the panel.
+        Continue each row past the detector, a fifth of its length on each side, from its outermost
+        value to 0 as a squared cosine: for samples that are wider than the detector.
     backend : {"scipy", "reikna"}, optional
         As for :class:`clra.ops.filtering.fft.RealFFT`; with "scipy" a call blocks the host.
     allocator : callable, optional
@@ -106,7 +106,7 @@ class RampFilter:
     window : str
         As given.
     padded : int
-        Columns of a line in the transforms, at least twice those of the panel.
+        Columns of a line in the transforms, at least twice those of the detector.
     scratch_bytes : int
         Of scratch memory.
 
@@ -259,7 +259,7 @@ def _view_table(
     """Make the table (views, 6) that ramp.cl reads."""
     distance = geometry.source_to_detector
     u, v = geometry.u / distance[:, None], geometry.v / distance[:, None]
-    # Of a panel that does not face the axis, columns are closer as the axis sees them.
+    # Of a detector that does not face the axis, columns are closer as the axis sees them.
     radius = np.hypot(*geometry.source[:, :2].T)
     to_axis = -geometry.source[:, :2] / np.maximum(radius, np.finfo(float).tiny)[:, None]
     along = np.sum(geometry.u[:, :2] * to_axis, axis=1)

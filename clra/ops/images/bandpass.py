@@ -29,11 +29,11 @@ class Bandpass:
     .. math:: D(q) = \sum_p b(q - p) \left[ \frac{h * (M I)}{h * M} - W \right](p)
 
     with the cubic B-spline b, so that D is defined between the pixels without interpolation error,
-    and the mask M, 0 outside the panel: pixels that do not count are replaced by a mean of their
+    and the mask M, 0 outside the detector: pixels that do not count are replaced by a mean of their
     neighbours (normalised convolution). b and h add up to a Gaussian of sigma `low_pass`. W(p) is
     the value at p of the plane fitted to the image with Gaussian weights of sigma `high_pass`,
     which is a Gaussian filter inside, and next to borders and masks keeps slopes from turning into
-    structures that would stand still in the panel. Slopes give 0 (but for the outermost pixels).
+    structures that would stand still in the detector. Slopes give 0 (but for the outermost pixels).
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ def gaussian_taps(sigma: float) -> NDArray[np.float64]:
 
 
 class Blur:
-    """Gaussian blur; near the border, of what lies on the panel.
+    """Gaussian blur; near the border, of what lies on the detector.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Blur:
             In order or out of order.
         blurred_out, image, between : cl.array.Array
             Lined images (at least n, rows, stride): result, input, scratch; those of the input and
-            scratch have to be zero beyond the panel. `blurred_out` may be `image`.
+            scratch have to be zero beyond the detector. `blurred_out` may be `image`.
         n : int
             Number of images.
         wait_for : sequence of cl.Event, optional

@@ -20,7 +20,7 @@ from clra.ops.runtime.kernel import Step, to_device
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
 # rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
 # twentieth of a back-projection. Where that tenth is less than _ALONG voxels, half or a quarter are
-# in a coarse one: with 4, a panel of 5 rows would see its middle plane 14 % too bright.
+# in a coarse one: with 4, a detector of 5 rows would see its middle plane 14 % too bright.
 _ACROSS, _ALONG = 8, 4
 # A voxel with less than this part of the most views that see the axis is set to zero: a handful of
 # views gives streaks, not a reconstruction.
@@ -87,7 +87,7 @@ class Coverage:
         self._grid = grid
         self._counted = (geometry.views, geometry.rows, geometry.columns)
         # One row or column is as good as two alike.
-        self._panel = (max(geometry.columns, 2), max(geometry.rows, 2))
+        self._detector = (max(geometry.columns, 2), max(geometry.rows, 2))
         pixel = np.linalg.norm(geometry.v, axis=1) * geometry.source_to_axis
         fade = FADE * geometry.rows * abs(np.median(pixel / geometry.source_to_detector))
         along = next((n for n in (_ALONG, _ALONG // 2) if fade >= n * grid.voxel_size), 1)
@@ -99,7 +99,7 @@ class Coverage:
         middles = 0.5 * ((coarse - 1) * sizes + voxels - 1)
         self._last_middles = ((middles - 0.5 * (sizes - 1)) / sizes).tolist()
         self._row_weight, self._circle = weights, circle
-        self._weights = to_device(context, np.resize(weights, self._panel[1]))
+        self._weights = to_device(context, np.resize(weights, self._detector[1]))
         self._weights_of_views = to_device(context, self._view_weight)
         self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
         self.scratch_bytes = self._seen.nbytes
@@ -109,12 +109,12 @@ class Coverage:
         self.set_geometry(geometry)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors for the same views and panel; :meth:`compute` counts anew.
+        """Take other vectors for the same views and detector; :meth:`compute` counts anew.
 
         Raises
         ------
         InputError
-            If views or panel differ.
+            If views or detector differ.
         """
         check_geometry(geometry, self._counted)
         self._matrices = to_device(self._context, self._coarse_matrices(geometry))
@@ -156,7 +156,7 @@ class Coverage:
             self._weights,
             *self._coarse,
             *self._last_middles,
-            *self._panel,
+            *self._detector,
             self._counted[0],
             wait_for=[*(wait_for or ()), *self._last],
         )

@@ -95,7 +95,7 @@ class Blocks:
             source,
             layout.table[views],
             *layout.sizes,
-            *layout.panel,
+            *layout.detector,
             views.stop - views.start,
             *more,
             wait_for=wait_for,

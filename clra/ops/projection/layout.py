@@ -64,7 +64,7 @@ class Layout:
         (views, 24), see geometry.clh.
     sizes : tuple of int
         nx, ny, nz.
-    panel : tuple of int
+    detector : tuple of int
         Columns, rows and elements of a padded line.
     scratch_bytes : int
         Most bytes of scratch memory that it takes.
@@ -88,7 +88,7 @@ class Layout:
         self.grid = grid
         self.lanes = lanes or _best_lanes(build.device_of(context))
         self.sizes = grid.shape[::-1]
-        self.panel = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
+        self.detector = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
         self.last: list[cl.Event] = []
         self._views = geometry.views
         self._tilted = tilted
@@ -107,8 +107,8 @@ class Layout:
         self.set_geometry(geometry)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors of the same views and panel."""
-        check_geometry(geometry, (self._views, self.panel[1], self.panel[0]))
+        """Take other vectors of the same views and detector."""
+        check_geometry(geometry, (self._views, self.detector[1], self.detector[0]))
         self.table = to_device(self.context, view_table(geometry, self.grid))
         self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
         self.steep = not geometry.axial and _steep(geometry)
@@ -124,7 +124,7 @@ class Layout:
         """Refuse what does not fit; first of the views, and one past the last."""
         start, stop = successive(views, self._views)
         build.check_queue(queue, self.context)
-        columns, rows, _ = self.panel
+        columns, rows, _ = self.detector
         build.check_array(names[0], volume, self._volume_shape, context=self.context)
         shape = (stop - start, rows, columns)
         build.check_array(names[1], projections, shape, context=self.context)
@@ -133,7 +133,7 @@ class Layout:
     @property
     def _view_elements(self) -> int:
         """Elements of a view's padded lines."""
-        columns, _, pitch = self.panel
+        columns, _, pitch = self.detector
         return (columns + 1) * pitch
 
     @property
@@ -152,7 +152,7 @@ class Layout:
     ) -> tuple[Array, cl.Event]:
         """Projections in the kernels' order, padded, in scratch."""
         lines = self.scratch_projections(len(projections))
-        columns, rows, pitch = self.panel
+        columns, rows, pitch = self.detector
         event = self._transpose(
             queue,
             Planes(lines, (columns + 1) * pitch, pitch, columns + 1, pitch),
@@ -171,7 +171,7 @@ class Layout:
         wait_for: Sequence[cl.Event],
     ) -> cl.Event:
         """From scratch to the caller's projections."""
-        columns, rows, pitch = self.panel
+        columns, rows, pitch = self.detector
         lines = self.scratch_projections(len(projections))[:, :, _PAD:]
         return self._transpose(
             queue,
@@ -184,7 +184,7 @@ class Layout:
 
     def scratch_projections(self, count: int) -> Array:
         """Lines of `count` views, (count, columns + 1, pitch)."""
-        columns, _, pitch = self.panel
+        columns, _, pitch = self.detector
         if self._lines is None or len(self._lines) < count:
             size = count * (columns + 1) * pitch
             flat = self._memory.empty((size + _PIECE,))
@@ -255,7 +255,7 @@ def _steep(geometry: ConeBeamGeometry) -> bool:
     corners = np.stack(
         [centre + a * across * geometry.u + b * down * geometry.v for a in (-1, 1) for b in (-1, 1)]
     )
-    # Over the panel, |z| is at most that of a corner, the larger of |x| and |y| at least the
+    # Over the detector, |z| is at most that of a corner, the larger of |x| and |y| at least the
     # distance from the axis of z over the root of 2, and that distance at least its part along the
     # way to the centre.
     level = centre[:, :2] / np.linalg.norm(centre[:, :2], axis=1, keepdims=True).clip(1e-30)

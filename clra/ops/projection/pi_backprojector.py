@@ -26,11 +26,11 @@ _STRIP = 32
 class PiBackProjector:
     """Sum filtered radiographs over each voxel's pi-interval.
 
-    A voxel sums p(column, row) / g over the views in which its shadow lies in the Tam-Danielsson
-    window, where p is interpolated bilinearly and g is the voxel's depth as a fraction of the
-    panel's. The window's borders are softened by half a row and by half of what the shadow moves
-    from view to view. Where several helices hold the whole pi-interval of a voxel, the voxel is the
-    mean of what they give; where none does, it is 0.
+    A voxel sums p(column, row) / g over the views in which its projection lies in the
+    Tam-Danielsson window, where p is interpolated bilinearly and g is the voxel's depth as a
+    fraction of the detector's. The window's borders are softened by half a row and by half of what
+    the projection moves from view to view. Where several helices hold the whole pi-interval of a
+    voxel, the voxel is the mean of what they give; where none does, it is 0.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class PiBackProjector:
                 nx,
                 ny,
                 nz,
-                *layout.panel,
+                *layout.detector,
                 last - first,
                 len(self._helices),
                 self._helix,

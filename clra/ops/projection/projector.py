@@ -95,12 +95,12 @@ class ForwardProjector:
         self._parts = [(a, min(a + thick, planes)) for a in range(0, planes, thick)]
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors for the same views and panel, for example another motion.
+        """Take other vectors for the same views and detector, for example another motion.
 
         Raises
         ------
         InputError
-            If views or panel differ, or the grid reaches behind a source.
+            If views or detector differ, or the grid reaches behind a source.
         """
         self._layout.set_geometry(geometry)
 
@@ -150,7 +150,7 @@ class ForwardProjector:
             for planes in self._parts:
                 event = self._project(
                     queue,
-                    (layout.panel[0], last - first),
+                    (layout.detector[0], last - first),
                     lines,
                     columns,
                     slice(start + first, start + last),
@@ -170,9 +170,9 @@ class BackProjector:
     """Back-projection of the FDK type, or the exact adjoint of :class:`ForwardProjector`.
 
     ``matched=False``: a voxel sums p(column, row) / g^2 over the views, where p is interpolated
-    bilinearly at the voxel's shadow and g is the voxel's depth as a fraction of the panel's; views
-    on whose panel [0, columns - 1] x [0, rows - 1] the shadow does not lie give nothing. Filtered
-    projections so give FDK's volume, see :mod:`clra.ops.filtering.ramp`.
+    bilinearly at the voxel's projection and g is the voxel's depth as a fraction of the detector's;
+    views on whose detector [0, columns - 1] x [0, rows - 1] the projection does not lie give
+    nothing. Filtered projections so give FDK's volume, see :mod:`clra.ops.filtering.ramp`.
 
     ``matched=True``: the transpose of the forward projection's matrix, border rules included. It
     gathers: the same input gives the same bits.
@@ -236,12 +236,12 @@ class BackProjector:
         self._matched = matched
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
-        """Take other vectors for the same views and panel, for example another motion.
+        """Take other vectors for the same views and detector, for example another motion.
 
         Raises
         ------
         InputError
-            If views or panel differ, or the grid reaches behind a source.
+            If views or detector differ, or the grid reaches behind a source.
         """
         self._layout.set_geometry(geometry)
 
@@ -322,10 +322,10 @@ class BackProjector:
         layout = self._layout
         event = self._weigh(
             queue,
-            (-(-layout.panel[1] // layout.lanes), layout.panel[0], len(lines)),
+            (-(-layout.detector[1] // layout.lanes), layout.detector[0], len(lines)),
             lines,
             layout.table[views],
-            *layout.panel,
+            *layout.detector,
             len(lines),
             int(layout.columnar),
             int(layout.lanes > 1 and not layout.columnar),

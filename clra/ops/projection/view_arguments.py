@@ -8,7 +8,7 @@ from clra.model.geometry import ConeBeamGeometry
 
 
 def check_geometry(geometry: ConeBeamGeometry, expected: tuple[int, int, int]) -> None:
-    """Refuse a geometry of other views or another panel.
+    """Refuse a geometry of other views or another detector.
 
     Parameters
     ----------

@@ -73,8 +73,8 @@ class Registration:
     the `Bandpass`, a spline that is evaluated between its pixels; the
     A_k are the measured image after it and the same blurred further by Gaussians of 2 and 4 pixels,
     in the mixture a that resembles B most, found anew in each step: a re-projection is less sharp
-    than a radiograph, and least squares takes this for magnification. c is the panel's centre. The
-    window w is 0 along the borders and rises to 1 smoothly.
+    than a radiograph, and least squares takes this for magnification. c is the detector's centre.
+    The window w is 0 along the borders and rises to 1 smoothly.
 
     Gradients are those of the simulated image, which has no noise. Intensity slopes and gains do
     not matter, as the band-pass takes them out and g is free.
@@ -96,7 +96,7 @@ class Registration:
         the border, a masked pixel or line is filled from its neighbours and left out.
     margin : float
         Part of the image's height and width over which the window rises, 0.02 to 0.3; it starts at
-        half of it from the border. Less lets in what moved into or out of the panel.
+        half of it from the border. Less lets in what moved into or out of the detector.
     iterations : int
         Largest number of Gauss-Newton steps; a view stops as soon as it moves less than 0.001 px.
     magnification : bool
@@ -127,8 +127,8 @@ class Registration:
 
     Notes
     -----
-    A view without usable signal (blank, constant, not finite, or unlike its twin) gets shift 0,
-    magnification 1, gain 1, correlation 0 and large sigmas (the image's longer side, and 1).
+    A view without usable signal (blank, constant, not finite, or unlike its counterpart) gets shift
+    0, magnification 1, gain 1, correlation 0 and large sigmas (the image's longer side, and 1).
 
     Standard errors come from the inverse normal matrix and the residual's variance. The residual is
     white noise after the band-pass, of which :math:`4 \pi s^2` neighbouring pixels count as one

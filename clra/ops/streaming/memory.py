@@ -31,8 +31,8 @@ def host_memory() -> int:
 
 # Radiographs in flight at once. Large enough that launching costs nothing beside computing, small
 # enough that the few of them (measured, filtered, simulated) are no burden on a laptop; at half or
-# twice the size the time of an iteration is the same within 3 %. Of large panels at least so many
-# views that reading and writing the volume for them costs little.
+# twice the size the time of an iteration is the same within 3 %. Of large detectors at least so
+# many views that reading and writing the volume for them costs little.
 _CHUNK_BYTES, _CHUNK_VIEWS = 96 << 20, 8
 # Pieces in which arrays are copied that are not copied whole.
 _PIECE_BYTES = 32 << 20

@@ -11,7 +11,12 @@ from clra.model.grid import VolumeGrid
 from clra.model.phantoms.ellipsoids import Ellipsoids
 from clra.ops.streaming.stream import Stream
 
-PANEL = {"source_to_axis": 3.0, "source_to_detector": 6.0, "pixel_size": 0.034, "shape": (77, 133)}
+DETECTOR = {
+    "source_to_axis": 3.0,
+    "source_to_detector": 6.0,
+    "pixel_size": 0.034,
+    "shape": (77, 133),
+}
 BODY = Ellipsoids(
     [[0, 0, 0], [0.3, 0.2, 0.05], [-0.35, -0.1, -0.1]],
     [[0.85, 0.8, 1.2], [0.25, 0.2, 0.3], [0.2, 0.25, 0.2]],
@@ -47,16 +52,16 @@ def errors(scan, level, method):
         yield tuple(np.sqrt(np.mean((image - truth)[held] ** 2)) for image in images)
 
 
-@pytest.mark.parametrize("level", [1, 2])  # the odd panel loses a row and a column
+@pytest.mark.parametrize("level", [1, 2])  # the odd detector loses a row and a column
 def test_katsevich_cuts_a_helix_and_its_motion_is_corrected(level):
     step = math.radians(3.6)
-    scan = moved(clra.helix(260, angle_step=step, z_step=step / (2 * math.pi), **PANEL))
+    scan = moved(clra.helix(260, angle_step=step, z_step=step / (2 * math.pi), **DETECTOR))
     for before, after in errors(scan, level, "Katsevich"):
         assert after < 0.6 * before
         assert after < 0.09
 
 
 def test_ramp_fbp_cuts_what_is_no_helix():
-    scan = moved(clra.circular(120, **PANEL))
+    scan = moved(clra.circular(120, **DETECTOR))
     (before, after), _ = errors(scan, 1, "ramp")
     assert after < 0.6 * before

@@ -66,7 +66,7 @@ def test_clusters_of_dead_pixels_are_masked() -> None:
     np.testing.assert_allclose(found[:], 0.5, rtol=1e-6)
 
 
-def test_a_dead_corner_of_a_tiny_panel() -> None:
+def test_a_dead_corner_of_a_tiny_detector() -> None:
     counts = frames(shape=(1, 2))
     counts[1, 0, 0] = 0.0
     np.testing.assert_allclose(radiographs(counts)[:], 0.5, rtol=1e-6)

@@ -289,9 +289,9 @@ def test_foreign_simulation_lands_in_its_shadow(data: Path, tmp_path: Path) -> N
     points = np.stack([-corners[:, 1], corners[:, 0], corners[:, 2]], axis=1)
     for image, seen in zip(pixels, scan.geometry.project(points), strict=True):
         rows, columns = np.nonzero(image > 0.05)
-        for shadow, predicted in ((columns, seen[:, 0]), (rows, seen[:, 1])):
-            assert shadow.min() == pytest.approx(predicted.min(), abs=2.0)
-            assert shadow.max() == pytest.approx(predicted.max(), abs=2.0)
+        for projection, predicted in ((columns, seen[:, 0]), (rows, seen[:, 1])):
+            assert projection.min() == pytest.approx(predicted.min(), abs=2.0)
+            assert projection.max() == pytest.approx(predicted.max(), abs=2.0)
 
 
 def test_synchrotron_scan(data: Path, tmp_path: Path) -> None:

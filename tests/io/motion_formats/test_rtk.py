@@ -10,7 +10,7 @@ from clra.io.motion_formats.rtk import read_rtk_geometry, write_rtk_geometry
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.trajectory import helix
 
-PANEL = {"shape": (5, 6), "pixel_size": 0.5}
+DETECTOR = {"shape": (5, 6), "pixel_size": 0.5}
 # Of a scanner of 300 mm, in mm and in pixels of half a mm.
 ROUNDING = 1e-10
 
@@ -26,9 +26,11 @@ def turned(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def tilted() -> ConeBeamGeometry:
-    """A helix whose sources and panels stand anyhow, each panel turned by some degrees."""
+    """A helix whose sources and detectors stand anyhow, each detector turned by some degrees."""
     rng = np.random.default_rng(0)
-    ideal = helix(7, angle_step=0.6, z_step=0.1, source_to_axis=30, source_to_detector=300, **PANEL)
+    ideal = helix(
+        7, angle_step=0.6, z_step=0.1, source_to_axis=30, source_to_detector=300, **DETECTOR
+    )
     tilts = 0.1 * rng.normal(size=(7, 3))
     return ConeBeamGeometry(
         source=ideal.source + rng.normal(size=(7, 3)),
@@ -40,7 +42,7 @@ def tilted() -> ConeBeamGeometry:
 
 
 def rtk_pixels(path: Path, points: np.ndarray) -> np.ndarray:
-    """Pixels by the matrices in the file: points in RTK's axes to mm from the panel's middle."""
+    """Pixels by the matrices in the file: points in RTK's axes to mm from the detector's middle."""
     seen = np.stack([points[:, 0], points[:, 2], -points[:, 1], np.ones(len(points))])
     found = []
     for element in ElementTree.parse(path).iter("Matrix"):
@@ -52,7 +54,7 @@ def rtk_pixels(path: Path, points: np.ndarray) -> np.ndarray:
 def test_geometry_survives(tmp_path: Path, tilted: ConeBeamGeometry) -> None:
     path = tmp_path / "geometry.xml"
     write_rtk_geometry(path, tilted)
-    read = read_rtk_geometry(path, **PANEL)
+    read = read_rtk_geometry(path, **DETECTOR)
     np.testing.assert_allclose(read.to_astra(), tilted.to_astra(), rtol=0, atol=ROUNDING)
 
 
@@ -65,17 +67,17 @@ def test_matrices_project_as_the_geometry(tmp_path: Path, tilted: ConeBeamGeomet
     )
 
 
-def test_rows_from_the_top_are_the_same_panel(tmp_path: Path, tilted: ConeBeamGeometry) -> None:
+def test_rows_from_the_top_are_the_same_detector(tmp_path: Path, tilted: ConeBeamGeometry) -> None:
     down = upside_down(tilted)
     one, two = tmp_path / "one.xml", tmp_path / "two.xml"
     write_rtk_geometry(one, tilted)
     write_rtk_geometry(two, down)
     assert one.read_text() == two.read_text()
-    read = read_rtk_geometry(two, **PANEL, top_down=True)
+    read = read_rtk_geometry(two, **DETECTOR, top_down=True)
     np.testing.assert_allclose(read.to_astra(), down.to_astra(), rtol=0, atol=ROUNDING)
 
 
-def test_skewed_panels_are_refused(tmp_path: Path, tilted: ConeBeamGeometry) -> None:
+def test_skewed_detectors_are_refused(tmp_path: Path, tilted: ConeBeamGeometry) -> None:
     skewed = ConeBeamGeometry(
         source=tilted.source,
         detector=tilted.detector,
@@ -97,18 +99,18 @@ def test_what_is_no_geometry(tmp_path: Path) -> None:
         "<RTKThreeDCircularGeometry><Projection><GantryAngle>x</GantryAngle></Projection>"
         "</RTKThreeDCircularGeometry>": "GantryAngle: found 'x', expected a number",
         "<RTKThreeDCircularGeometry><RadiusCylindricalDetector>5</RadiusCylindricalDetector>"
-        "<Projection/></RTKThreeDCircularGeometry>": "expected 0: a flat panel",
+        "<Projection/></RTKThreeDCircularGeometry>": "expected 0: a flat detector",
     }.items():
         path.write_text(text)
         with pytest.raises(InputError, match=message):
-            read_rtk_geometry(path, **PANEL)
+            read_rtk_geometry(path, **DETECTOR)
     with pytest.raises(InputError, match="No such file"):
-        read_rtk_geometry(tmp_path / "none.xml", **PANEL)
+        read_rtk_geometry(tmp_path / "none.xml", **DETECTOR)
 
 
 def test_file_written_by_rtk(data: Path, tmp_path: Path) -> None:
     path = data / "rtk_geometry_written_by_itk_rtk.xml"
-    geometry = read_rtk_geometry(path, **PANEL)
+    geometry = read_rtk_geometry(path, **DETECTOR)
     points = np.random.default_rng(2).normal(size=(4, 3))
     expected = rtk_pixels(path, points)
     np.testing.assert_allclose(geometry.project(points), expected, rtol=0, atol=1e-8)

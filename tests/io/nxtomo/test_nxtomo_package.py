@@ -35,8 +35,8 @@ def test_the_package_reads_what_we_write(tmp_path: Path, units) -> None:
     flats = np.full((2, 5, 7), 1000, np.uint16)
     darks = np.full((3, 5, 7), 10, np.uint16)
     path = tmp_path / "scan.nxs"
-    frames, believed = {"flats": flats, "darks": darks}, np.arange(6) != 2
-    write_nxtomo(path, pixels, geometry, **frames, believed=believed, name="helix")
+    frames, valid_views = {"flats": flats, "darks": darks}, np.arange(6) != 2
+    write_nxtomo(path, pixels, geometry, **frames, valid_views=valid_views, name="helix")
 
     read = NXtomo().load(str(path), "entry", detector_data_as="as_numpy_array")
     NXtomo.check_consistency(read, raises_error=True)

@@ -18,7 +18,7 @@ from ..conftest import COLUMNS, ROLES, ROWS, VIEWS, Builder, put, transmission
 
 # Rounding of degrees and of the distances' differences, relative to the scanner's size.
 ROUNDING = 1e-12
-PANEL = {"source_to_axis": 30.0, "source_to_detector": 300.0, "pixel_size": 0.5, "shape": (5, 6)}
+DETECTOR = {"source_to_axis": 30.0, "source_to_detector": 300.0, "pixel_size": 0.5, "shape": (5, 6)}
 
 
 def in_the_lab(
@@ -165,17 +165,17 @@ def test_parallel_beam_is_a_far_source(nxtomo_file: Builder) -> None:
 def test_overrides_beat_file_and_vectors(nxtomo_file: Builder, tmp_path: Path) -> None:
     assert read_scan(nxtomo_file(), source_distance=50.0).geometry.source_to_axis[0] == 50.0
     path = tmp_path / "ours.nxs"
-    write_scan(path, Scan(np.zeros((4, 5, 6), np.float32), circular(4, **PANEL)))
+    write_scan(path, Scan(np.zeros((4, 5, 6), np.float32), circular(4, **DETECTOR)))
     found = read_scan(path, source_distance=-50.0).geometry
     np.testing.assert_allclose(found.source_to_axis, 50.0, rtol=1e-12)
 
 
 TRAJECTORIES = {
-    "circular": circular(9, **PANEL),
-    "arc": circular(5, start=1.0, arc=-2.0, **PANEL),
-    "helix": helix(9, angle_step=0.5, z_step=0.1, **PANEL),
-    "double-helix": double_helix(5, angle_step=0.7, z_step=0.1, **PANEL),
-    "space-filling": space_filling(9, z_step=0.1, angle_step=2.7, **PANEL),
+    "circular": circular(9, **DETECTOR),
+    "arc": circular(5, start=1.0, arc=-2.0, **DETECTOR),
+    "helix": helix(9, angle_step=0.5, z_step=0.1, **DETECTOR),
+    "double-helix": double_helix(5, angle_step=0.7, z_step=0.1, **DETECTOR),
+    "space-filling": space_filling(9, z_step=0.1, angle_step=2.7, **DETECTOR),
 }
 
 
@@ -232,7 +232,7 @@ def test_general_geometry_survives(tmp_path: Path) -> None:
 def test_far_source_survives(tmp_path: Path) -> None:
     far = far_source_distance((5, 6), 0.5)
     geometry = upside_down(
-        circular(7, **{**PANEL, "source_to_axis": far, "source_to_detector": far})
+        circular(7, **{**DETECTOR, "source_to_axis": far, "source_to_detector": far})
     )
     assert fields_of(geometry)[1]
     path = tmp_path / "scan.nxs"
@@ -256,7 +256,7 @@ def test_invalid_frames_keep_geometry_and_truth_in_step(
     options = {"flats": flats, "darks": flats[:1] * 0, "truth": truth}
     kept = np.delete(np.arange(9), [0, 4])
     if by == "writing":
-        options["believed"] = np.isin(np.arange(9), kept)
+        options["valid_views"] = np.isin(np.arange(9), kept)
     write_nxtomo(path, pixels, geometry, **options)
     with h5py.File(path, "r+") as file:
         for key in ("image_key", "image_key_control"):
@@ -274,13 +274,15 @@ def test_invalid_frames_keep_geometry_and_truth_in_step(
     assert "2 frames marked invalid left out" in scan.projections.notes
 
 
-@pytest.mark.parametrize("believed", [np.ones(8, np.bool_), np.zeros(9, np.bool_), np.ones(9, int)])
-def test_choices_of_views_that_are_none(tmp_path: Path, believed: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    "valid_views", [np.ones(8, np.bool_), np.zeros(9, np.bool_), np.ones(9, int)]
+)
+def test_choices_of_views_that_are_none(tmp_path: Path, valid_views: np.ndarray) -> None:
     scan = Scan(np.zeros((9, 5, 6), np.float32), TRAJECTORIES["circular"])
     with pytest.raises(
-        ValueError, match=r"believed: found .*, expected \(9,\) of bool with one or more"
+        ValueError, match=r"valid_views: found .*, expected \(9,\) of bool with one or more"
     ):
-        write_scan(tmp_path / "scan.nxs", scan, believed=believed)
+        write_scan(tmp_path / "scan.nxs", scan, valid_views=valid_views)
     assert not list(tmp_path.iterdir())
 
 

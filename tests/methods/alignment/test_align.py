@@ -18,8 +18,8 @@ VIEWS, SHAPE = 180, (128, 128)
 SCALE = 4
 HEIGHT = 0.7
 RADIUS = 240 * 0.004544
-# Pixels of the panel as simulated, gauge-free: the paper's result for space-filling scans is 0.20
-# at four times this resolution.
+# Pixels of the detector as simulated, gauge-free: the paper's result for space-filling scans is
+# 0.20 at four times this resolution.
 TOLERANCE = 0.20
 
 
@@ -59,7 +59,7 @@ def test_motion_is_found(moved, result):
     error = Gauge(moved.geometry, points).error(result.motion, moved.truth)
     assert error.gauge_free_u < TOLERANCE
     assert error.gauge_free_v < TOLERANCE
-    # Panels of 128 columns hardly tell magnifications of 0.1 %: what counts is no drift of it.
+    # Detectors of 128 columns hardly tell magnifications of 0.1 %: what counts is no drift of it.
     assert error.mae_m < 1e-3
     assert np.mean(np.log(result.motion.magnification)) == pytest.approx(0, abs=1e-12)
 
@@ -218,12 +218,20 @@ def test_one_view_cannot_be_aligned(moved):
 @pytest.mark.parametrize(
     ("shape", "method", "message"),
     [
-        ((40, 90), "ra", "line: panel: found 40 x 90 pixels, 10 x 22 at QR, expected at least 16"),
-        ((40, 90), "imgr", "line: panel: found 40 x 90 pixels, 10 x 22 at QR, expected at least"),
+        (
+            (40, 90),
+            "ra",
+            "line: detector: found 40 x 90 pixels, 10 x 22 at QR, expected at least 16",
+        ),
+        (
+            (40, 90),
+            "imgr",
+            "line: detector: found 40 x 90 pixels, 10 x 22 at QR, expected at least",
+        ),
         ((1, 90), "ra", "factor: found 4, expected at most 1 to bin 1 x 90 pixels"),
     ],
 )
-def test_panels_too_small_for_a_level(shape, method, message):
+def test_detectors_too_small_for_a_level(shape, method, message):
     geometry = clra.circular(
         5, source_to_axis=9.0, source_to_detector=20.0, pixel_size=0.05, shape=shape
     )

@@ -1,4 +1,4 @@
-"""Static geometry that is off: closed-form radiographs taken by a panel shifted and turned."""
+"""Static geometry that is off: closed-form radiographs taken by a detector shifted and turned."""
 
 import math
 
@@ -8,10 +8,10 @@ import pytest
 import clra
 from clra.app.simulation import paper_like, sample, simulated_motion
 from clra.methods.alignment.autofocus import Focus, autofocus, sharpening_by_turning_back
-from clra.model.detector_pose import with_panel
+from clra.model.detector_pose import with_detector
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
-from clra.model.rotation_sense import turned_back
+from clra.model.rotation_sense import opposite_rotation
 
 OFFSET, TILT = 6.0, math.radians(1.0)
 VIEWS, SHAPE = 90, (64, 64)
@@ -20,7 +20,7 @@ VIEWS, SHAPE = 90, (64, 64)
 def _scan(trajectory, jitter=0.0, offset=OFFSET):
     geometry = paper_like(trajectory, VIEWS, SHAPE)
     truth = simulated_motion("random", geometry, shift=(-jitter, jitter), seed=3)
-    real = with_panel(geometry, offset_u=offset, tilt=TILT).with_motion(truth)
+    real = with_detector(geometry, offset_u=offset, tilt=TILT).with_motion(truth)
     rock = sample("porous", geometry, 1)
     return clra.Scan(rock.line_integrals(real), geometry, truth=truth)
 
@@ -33,7 +33,7 @@ def test_offset_and_tilt_are_found():
 
 
 def _error(scan, focus):
-    """Of the shifts that alignment finds, those of the panel included."""
+    """Of the shifts that alignment finds, those of the detector included."""
     motion = clra.align(focus.applied(scan), schedule="3HR", estimate="shift").motion
     whole = clra.Motion(shift_u=motion.shift_u + focus.offset_u - OFFSET, shift_v=motion.shift_v)
     points = sample_points(default_grid(scan.geometry))
@@ -41,18 +41,18 @@ def _error(scan, focus):
 
 
 @pytest.mark.parametrize("trajectory", ["helix", "space-filling"])
-def test_a_scan_that_jitters_is_aligned_as_if_the_panel_had_been_known(trajectory):
+def test_a_scan_that_jitters_is_aligned_as_if_the_detector_had_been_known(trajectory):
     scan = _scan(trajectory, jitter=4.0)
     found = autofocus(scan)
     # A mean shift of the views themselves looks the same.
     assert found.offset_u - OFFSET == pytest.approx(scan.truth.shift_u.mean(), abs=0.05)
     assert found.tilt == pytest.approx(TILT, abs=math.radians(0.1))
-    best, after, believed = (
+    best, after, valid_views = (
         _error(scan, focus) for focus in (Focus(OFFSET, TILT, 1.0), found, Focus(0.0, 0.0, 1.0))
     )
     assert after.gauge_free_u < 1.1 * best.gauge_free_u
     assert after.gauge_free_v < 1.1 * best.gauge_free_v
-    assert believed.mae_u > 2 * best.mae_u
+    assert valid_views.mae_u > 2 * best.mae_u
 
 
 def test_a_focus_out_of_reach_is_said():
@@ -70,7 +70,7 @@ def test_a_sample_that_turns_the_other_way_is_noticed(trajectory):
     scan = _scan(trajectory, jitter=2.0)
     motion = clra.Motion(shift_u=scan.truth.shift_u + OFFSET, shift_v=scan.truth.shift_v)
     assert sharpening_by_turning_back(scan, motion) < 0.8
-    mirrored = clra.Scan(scan.projections, turned_back(scan.geometry))
+    mirrored = clra.Scan(scan.projections, opposite_rotation(scan.geometry))
     assert sharpening_by_turning_back(mirrored, motion) > 1.2
 
 

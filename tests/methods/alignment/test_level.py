@@ -44,7 +44,7 @@ def scan():
 
 def _found(scan, solver, memory=None):
     level = Level(Stream(max_device_memory=memory), scan, GRID, solver, 2)
-    options = {"believed": np.ones(VIEWS, np.bool_), "first": False, "magnification": True}
+    options = {"valid_views": np.ones(VIEWS, np.bool_), "first": False, "magnification": True}
     options |= {"measure": True, "title": "test"}
     motion, still = Motion.identity(VIEWS), np.ones(VIEWS)
     found = [level.residual_motion(motion, still, **options).motion for _ in range(2)]

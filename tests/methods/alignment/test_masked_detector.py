@@ -1,4 +1,5 @@
-"""A panel of which only a part sees the sample, as in the paper: 2304 of 3040 columns, in small."""
+"""A detector of which only a part sees the sample, as in the paper: 2304 of 3040 columns, in
+small."""
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ import clra
 from clra.app.simulation import paper_like, sample, simulated_motion
 
 VIEWS, SHAPE = 120, (96, 96)
-TOP, LEFT, PANEL = 7, 20, (110, 128)
+TOP, LEFT, DETECTOR = 7, 20, (110, 128)
 
 
 @pytest.fixture(scope="module")
@@ -20,23 +21,23 @@ def seen():
 
 @pytest.fixture(scope="module")
 def masked(seen):
-    """The same radiographs on a larger panel whose sides are shadowed."""
+    """The same radiographs on a larger detector whose sides are shadowed."""
     small = seen.geometry
-    aside_u = LEFT + SHAPE[1] / 2 - PANEL[1] / 2
-    aside_v = TOP + SHAPE[0] / 2 - PANEL[0] / 2
+    offset_u = LEFT + SHAPE[1] / 2 - DETECTOR[1] / 2
+    offset_v = TOP + SHAPE[0] / 2 - DETECTOR[0] / 2
     geometry = clra.ConeBeamGeometry(
         source=small.source,
-        detector=small.detector - aside_u * small.u - aside_v * small.v,
+        detector=small.detector - offset_u * small.u - offset_v * small.v,
         u=small.u,
         v=small.v,
-        shape=PANEL,
+        shape=DETECTOR,
     )
-    pixels = np.full((VIEWS, *PANEL), 7.0, np.float32)
-    mask = np.zeros(PANEL, np.bool_)
+    pixels = np.full((VIEWS, *DETECTOR), 7.0, np.float32)
+    mask = np.zeros(DETECTOR, np.bool_)
     window = np.s_[TOP : TOP + SHAPE[0], LEFT : LEFT + SHAPE[1]]
     mask[window] = True
     pixels[:, *window] = seen.read(0, VIEWS)
-    return clra.Scan(pixels, geometry, mask=mask, truth=seen.truth.about(-aside_u, -aside_v))
+    return clra.Scan(pixels, geometry, mask=mask, truth=seen.truth.about(-offset_u, -offset_v))
 
 
 def test_cropping_gives_the_part_that_sees_the_sample(seen, masked):
@@ -48,8 +49,8 @@ def test_cropping_gives_the_part_that_sees_the_sample(seen, masked):
     assert seen.cropped() is seen
 
 
-def test_the_true_motion_means_the_same_on_both_panels(seen, masked):
-    # A motion of the whole panel, absorbed, shows the window what the window's own shows.
+def test_the_true_motion_means_the_same_on_both_detectors(seen, masked):
+    # A motion of the whole detector, absorbed, shows the window what the window's own shows.
     whole = masked.geometry.with_motion(masked.truth)
     part = seen.geometry.with_motion(seen.truth)
     points = np.random.default_rng(0).normal(scale=0.2, size=(9, 3))
@@ -60,7 +61,7 @@ def test_alignment_and_volume_are_those_of_the_part(seen, masked):
     found = clra.align(masked, schedule="1QR-1HR")
     expected = clra.align(seen, schedule="1QR-1HR")
     np.testing.assert_allclose(
-        found.motion.about(*masked.window_aside).shift_u, expected.motion.shift_u, atol=1e-3
+        found.motion.about(*masked.window_offset).shift_u, expected.motion.shift_u, atol=1e-3
     )
     assert found.history[-1].gauge_free_u == pytest.approx(
         expected.history[-1].gauge_free_u, abs=1e-3

@@ -44,7 +44,7 @@ def test_without_motion_nothing_changes(moved):
 
 
 def test_every_second_view_may_be_bad(moved):
-    believed = np.arange(VIEWS) % 2 == 0
-    found = quality(Stream(), moved, moved.truth, 2, believed)
+    valid_views = np.arange(VIEWS) % 2 == 0
+    found = quality(Stream(), moved, moved.truth, 2, valid_views)
     whole = quality(Stream(), moved, moved.truth, 2)
     assert 0 < found.half_u < 4 * whole.half_u

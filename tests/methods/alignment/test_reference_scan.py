@@ -103,7 +103,7 @@ def test_what_is_no_reference_is_refused(drifted, reference, drift):
     other = clra.Scan(np.zeros((9, 8, 8)), clra.circular(
         9, source_to_axis=5.0, source_to_detector=50.0, pixel_size=1.0, shape=(8, 8)
     ))  # fmt: skip
-    with pytest.raises(ValueError, match=r"panel: found 8 x 8 pixels, expected 112 x 128"):
+    with pytest.raises(ValueError, match=r"detector: found 8 x 8 pixels, expected 112 x 128"):
         clra.align(drifted, reference=other)
     with pytest.raises(ValueError, match="reference, motion: found both"):
         clra.align(drifted, reference=reference, motion=drift)

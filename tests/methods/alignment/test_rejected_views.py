@@ -1,4 +1,4 @@
-"""Views that are not believed, and what they are given instead."""
+"""Views that are rejected, and what they are given instead."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ import pytest
 import clra
 from clra.methods.alignment.rejected_views import (
     from_neighbours,
-    handed_on,
-    odd_radiographs,
+    neighbour_weights,
     outliers,
+    unusable_radiographs,
 )
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -20,7 +20,7 @@ def test_views_far_below_the_others_are_found():
     assert np.flatnonzero(outliers(correlation)).tolist() == [7, 120]
 
 
-def test_views_that_are_equally_good_are_all_believed():
+def test_views_that_are_equally_good_are_all_valid_views():
     assert not outliers(np.full(50, 0.99)).any()
     assert not outliers(np.linspace(0.91, 0.99, 50)).any()
 
@@ -41,7 +41,7 @@ def _odd(images):
     )
     stream = Stream()
     return np.flatnonzero(
-        odd_radiographs(stream, Radiographs(stream, clra.Scan(images, geometry), 1))
+        unusable_radiographs(stream, Radiographs(stream, clra.Scan(images, geometry), 1))
     ).tolist()
 
 
@@ -65,8 +65,8 @@ def _around(views):
 
 
 def test_the_weight_of_a_view_left_out_goes_to_those_beside_it():
-    believed = np.arange(72) != 0
-    weights = handed_on(_around(72), believed)
+    valid_views = np.arange(72) != 0
+    weights = neighbour_weights(_around(72), valid_views)
     assert weights.sum() == pytest.approx(72)
     # By the inverse squared distance, 1 : 2 : 3 but for a little: the sources stand on a circle.
     shares = np.array([1, 1 / 4, 1 / 9]) / (2 * (1 + 1 / 4 + 1 / 9))
@@ -77,23 +77,25 @@ def test_the_weight_of_a_view_left_out_goes_to_those_beside_it():
 
 def test_beside_means_where_the_source_was_and_not_when():
     order = np.random.default_rng(0).permutation(72)
-    believed = np.arange(72) != 0
-    weights = handed_on(_around(72)[order], believed[order])
-    assert np.allclose(weights, handed_on(_around(72), believed)[order], rtol=1e-12)
+    valid_views = np.arange(72) != 0
+    weights = neighbour_weights(_around(72)[order], valid_views[order])
+    assert np.allclose(weights, neighbour_weights(_around(72), valid_views)[order], rtol=1e-12)
 
 
 def test_a_long_gap_stays_a_gap():
-    believed = np.arange(72) >= 20
-    weights = handed_on(_around(72), believed)
+    valid_views = np.arange(72) >= 20
+    weights = neighbour_weights(_around(72), valid_views)
     # The six nearest at either end at most double.
     assert weights.max() == 2 and 52 < weights.sum() <= 64
 
 
 def test_weights_without_a_choice():
-    assert (handed_on(_around(9), np.ones(9, np.bool_)) == 1).all()
-    assert handed_on(_around(9), np.arange(9) == 4).tolist() == [0, 0, 0, 0, 2, 0, 0, 0, 0]
+    assert (neighbour_weights(_around(9), np.ones(9, np.bool_)) == 1).all()
+    assert neighbour_weights(_around(9), np.arange(9) == 4).tolist() == [0, 0, 0, 0, 2, 0, 0, 0, 0]
     # Views from one and the same place.
-    assert handed_on(np.ones((4, 3)), np.arange(4) > 0)[1:].tolist() == pytest.approx([4 / 3] * 3)
+    assert neighbour_weights(np.ones((4, 3)), np.arange(4) > 0)[1:].tolist() == pytest.approx(
+        [4 / 3] * 3
+    )
 
 
 def test_weak_views_get_what_lies_between_their_neighbours():

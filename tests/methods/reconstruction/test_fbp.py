@@ -15,7 +15,7 @@ from clra.ops.streaming.stream import Stream
 
 # The paper's simulation at an eighth of its resolution, all lengths as there.
 VIEWS, SHAPE, PIXEL = 432, (116, 64), 0.4544 * 8
-PANEL = {"source_to_axis": 4.3627, "source_to_detector": 436.27, "pixel_size": PIXEL}
+DETECTOR = {"source_to_axis": 4.3627, "source_to_detector": 436.27, "pixel_size": PIXEL}
 TRAVEL = 3456 * 0.001641
 VOXEL = 0.004544 * 8
 TOLERANCE = 0.08  # of the sphere's attenuation: what ramp-FBP can do for helices
@@ -25,10 +25,10 @@ def _scan(trajectory):
     z_step = TRAVEL / VIEWS
     if trajectory == "helix":
         geometry = clra.helix(
-            VIEWS, angle_step=math.radians(4.0), z_step=z_step, shape=SHAPE, **PANEL
+            VIEWS, angle_step=math.radians(4.0), z_step=z_step, shape=SHAPE, **DETECTOR
         )
     else:
-        geometry = clra.space_filling(VIEWS, z_step=z_step, shape=SHAPE, **PANEL)
+        geometry = clra.space_filling(VIEWS, z_step=z_step, shape=SHAPE, **DETECTOR)
     spheres = three_spheres(60 * VOXEL / 2, 156 * VOXEL)
     return clra.Scan(spheres.line_integrals(geometry, oversample=2), geometry), spheres
 
@@ -80,7 +80,7 @@ def test_views_count_by_the_angle_they_stand_for(geometry):
 
 
 def _turned(geometry, about_u=0.0, about_v=0.0, in_plane=0.0):
-    """The same with the panel turned about its column and row directions, and in its plane."""
+    """The same with the detector turned about its column and row directions, and in its plane."""
     u, v, normal = geometry.u, geometry.v, geometry.normal  # a pixel is 1 mm
     for angle, one, other in ((about_u, "v", "n"), (about_v, "u", "n"), (in_plane, "u", "v")):
         c, s, steps = math.cos(angle), math.sin(angle), {"u": u, "v": v, "n": normal}
@@ -92,18 +92,18 @@ def _turned(geometry, about_u=0.0, about_v=0.0, in_plane=0.0):
 
 
 @pytest.mark.parametrize(("about_u", "about_v"), [(0.2, 0), (0, 0.2), (-0.3, 0.25), (0.5, 0)])
-def test_a_panel_that_does_not_face_the_axis_changes_nothing(about_u, about_v):
+def test_a_detector_that_does_not_face_the_axis_changes_nothing(about_u, about_v):
     # As if it did, 0.2 rad would take 2 % off the values about u, and 4 % about v.
-    panel = FAN | {"shape": (41, 52)}
-    geometry = _turned(clra.circular(240, **panel), about_u, about_v)
+    detector = FAN | {"shape": (41, 52)}
+    geometry = _turned(clra.circular(240, **detector), about_u, about_v)
     assert _in_the_middle(geometry) == pytest.approx([1, 1], abs=0.01)
 
 
 def test_rows_that_run_up_and_down_are_warned_of():
-    panel = FAN | {"shape": (48, 48)}
-    _in_the_middle(_turned(clra.circular(60, **panel), in_plane=0.1))
+    detector = FAN | {"shape": (48, 48)}
+    _in_the_middle(_turned(clra.circular(60, **detector), in_plane=0.1))
     with pytest.warns(UserWarning, match="which rise by 90 degrees, expected less than 10"):
-        _in_the_middle(_turned(clra.circular(60, **panel), in_plane=math.pi / 2))
+        _in_the_middle(_turned(clra.circular(60, **detector), in_plane=math.pi / 2))
 
 
 def test_a_part_of_a_turn_is_warned_of():
@@ -112,11 +112,11 @@ def test_a_part_of_a_turn_is_warned_of():
 
 
 @pytest.mark.parametrize("method", ["fbp", "osem-tr", "imgr"])
-def test_a_sample_wider_than_the_panel_is_warned_of(method):
+def test_a_sample_wider_than_the_detector_is_warned_of(method):
     geometry = clra.circular(60, **FAN)
     body = Ellipsoids([(0, 0, 0)], [(14, 14, 30)], [0.1])  # the field of view's radius is 11.7
     scan = clra.Scan(body.line_integrals(geometry), geometry)
-    with pytest.warns(UserWarning, match="beyond the panel .line integrals of 1.6"):
+    with pytest.warns(UserWarning, match="beyond the detector .line integrals of 1.6"):
         volume = clra.reconstruct(scan, method)
     assert volume[2].max() > 1.3 * 0.1
 
@@ -134,25 +134,25 @@ def test_slabs_and_chunks_change_nothing():
 # Of what merely leaving views out changes in a volume blurred by a voxel: on a helix those beside
 # look from 4 degrees aside, on the other from 12 and more.
 @pytest.mark.parametrize(("trajectory", "part"), [("helix", 0.3), ("space-filling", 0.65)])
-def test_views_that_are_not_believed_are_left_out_and_stood_in_for(trajectory, part):
+def test_views_that_are_not_valid_views_are_left_out_and_stood_in_for(trajectory, part):
     scan, _ = _scan(trajectory)
     grid = VolumeGrid(shape=(41, 40, 38), voxel_size=1.5 * VOXEL)
-    believed = np.ones(VIEWS, np.bool_)
-    believed[[0, 7, 8, 200, 220, 240, 300, VIEWS - 1]] = False
+    valid_views = np.ones(VIEWS, np.bool_)
+    valid_views[[0, 7, 8, 200, 220, 240, 300, VIEWS - 1]] = False
     pixels = scan.read(0, VIEWS).copy()
-    pixels[~believed] = np.nan
+    pixels[~valid_views] = np.nan
     stream = Stream()
     spoilt = clra.Scan(pixels, scan.geometry)
     volume = ramp_fbp(
-        stream, Radiographs(stream, spoilt, 1), scan.geometry, grid, believed=believed
+        stream, Radiographs(stream, spoilt, 1), scan.geometry, grid, valid_views=valid_views
     ).to_host()
-    whole, without = (clra.reconstruct(s, grid=grid) for s in (scan, scan.subset(believed)))
+    whole, without = (clra.reconstruct(s, grid=grid) for s in (scan, scan.subset(valid_views)))
     changed, gaps = (gaussian_filter(v - whole, 1).std() for v in (volume, without))
     assert changed < part * gaps
 
 
 def test_motion_is_absorbed():
-    geometry = clra.circular(40, shape=(31, 33), **PANEL)
+    geometry = clra.circular(40, shape=(31, 33), **DETECTOR)
     spheres = three_spheres(20 * VOXEL / 2, 25 * VOXEL)
     rng = np.random.default_rng(3)
     motion = clra.Motion(
@@ -170,7 +170,7 @@ def test_motion_is_absorbed():
 
 
 def test_a_volume_that_no_view_sees_is_zero():
-    geometry = clra.circular(5, shape=(9, 9), **PANEL)
+    geometry = clra.circular(5, shape=(9, 9), **DETECTOR)
     pixels = np.zeros((5, 9, 9), np.float32)
     pixels[:, :, 3:6] = 1
     scan = clra.Scan(pixels, geometry)
@@ -179,13 +179,13 @@ def test_a_volume_that_no_view_sees_is_zero():
 
 
 def test_default_grid_is_the_field_of_view():
-    geometry = clra.circular(7, shape=(9, 11), **PANEL)
+    geometry = clra.circular(7, shape=(9, 11), **DETECTOR)
     scan = clra.Scan(np.zeros((7, 9, 11), np.float32), geometry)
     assert clra.reconstruct(scan).shape == default_grid(geometry).shape
 
 
 def test_options_that_are_none():
-    geometry = clra.circular(3, shape=(4, 4), **PANEL)
+    geometry = clra.circular(3, shape=(4, 4), **DETECTOR)
     scan = clra.Scan(np.zeros((3, 4, 4), np.float32), geometry)
     with pytest.raises(ValueError, match="method: found 'magic', expected one of"):
         clra.reconstruct(scan, method="magic")

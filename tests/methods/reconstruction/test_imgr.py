@@ -130,7 +130,7 @@ def test_noise_and_few_views_are_taken_better_than_by_filtered_back_projection(s
 def test_an_interrupted_run_goes_on_as_if_it_had_not_been(scan, grid, stream, monkeypatch):
     monkeypatch.setattr("clra.methods.reconstruction.imgr.converged", lambda *updates: False)
 
-    def run(reports, progressed=None):
+    def run(reports, state=None):
         count = [0]
 
         def report(progress):
@@ -141,7 +141,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(scan, grid, stream, mo
 
         stream._report = report
         try:
-            return imgr(stream, scan, grid, align=True, cycles=2, progressed=progressed)
+            return imgr(stream, scan, grid, align=True, cycles=2, state=state)
         finally:
             stream._report = None
 
@@ -150,7 +150,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(scan, grid, stream, mo
     for level, name in enumerate(["QR", "HR", "FR", "QR"], 1):
         with pytest.raises(ReconstructionInterrupted) as stopped:
             run(level)
-        state = stopped.value.progressed
+        state = stopped.value.state
         assert [step.level for step in state.steps][-1] == name
         assert stopped.value.alignment.history[-1].level == name
         assert state.volume.grid.voxel_size == pytest.approx(
@@ -195,7 +195,7 @@ def test_features_move_from_one_motion_to_another(geometry, truth, level):
 
 
 def test_simulated_radiographs_follow_the_motion(rock, geometry, truth, grid, stream):
-    """Resampled, they are what a projection with the panel moved gives."""
+    """Resampled, they are what a projection with the detector moved gives."""
     # Edges as sharp as voxels no interpolation follows; volumes prolongated have none.
     volume = volume_from(stream, grid, gaussian_filter(rock.volume(grid), 1.5))
 
@@ -233,7 +233,7 @@ def test_less_memory_than_the_volume_makes_the_same_volume(scan, grid):
     assert np.linalg.norm(tight - free) < 1e-5 * np.linalg.norm(free)
 
 
-def test_few_views_are_believed_less(geometry, grid):
+def test_few_views_are_valid_views_less(geometry, grid):
     assert sampled(geometry, grid) == 1
     few = geometry.subset(slice(None, None, 16))
     assert sampled(few, grid) == pytest.approx(sampled(few, grid.binned(2)) / 2, rel=0.1)

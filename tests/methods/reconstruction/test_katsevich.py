@@ -31,8 +31,8 @@ BODY = Ellipsoids(
 )
 
 
-def panel_of(pitch: float, columns: int) -> dict:
-    """A panel as tall as the pitch needs."""
+def detector_of(pitch: float, columns: int) -> dict:
+    """A detector as tall as the pitch needs."""
     tangent = math.tan(math.asin(FIELD / R))
     pixel = 2 * D * tangent / columns
     top = pitch / (2 * math.pi * R) * (1 + tangent**2) * (math.pi / 2 + math.atan(tangent)) * D
@@ -43,9 +43,9 @@ def panel_of(pitch: float, columns: int) -> dict:
 def helix_of(pitch=1.0, columns=91, views_a_turn=120, height=1.8, start=0.3, sense=1, **changes):
     views = int((height / pitch + 1.3) * views_a_turn) + 1
     step = 2 * math.pi / views_a_turn
-    panel = panel_of(pitch, columns) | changes
+    detector = detector_of(pitch, columns) | changes
     z_step = sense * pitch / views_a_turn
-    return clra.helix(views, angle_step=step, z_step=z_step, start=start, **panel)
+    return clra.helix(views, angle_step=step, z_step=z_step, start=start, **detector)
 
 
 def other(geometry: ConeBeamGeometry, **changes) -> ConeBeamGeometry:
@@ -129,7 +129,7 @@ def _all_kinds():
 
 
 @pytest.mark.parametrize(("kind", "geometry"), _all_kinds().items())
-def test_any_hand_sense_and_panel(kind, geometry):
+def test_any_hand_sense_and_detector(kind, geometry):
     scan = clra.Scan(BODY.line_integrals(geometry), geometry)
     volume = clra.reconstruct(scan, method="katsevich", grid=SMALL)
     mean, rms = flat_errors(volume, BODY, SMALL)
@@ -146,7 +146,7 @@ def test_any_pitch_start_and_size(seed):
         sense=random.choice([-1, 1]),
         start=random.uniform(-7, 7),
     )
-    wider = random.integers(0, 12, 2)  # rows and columns that one side of the panel has more
+    wider = random.integers(0, 12, 2)  # rows and columns that one side of the detector has more
     off = random.uniform(-0.5, 0.5, 2) * wider
     geometry = other(
         upright,
@@ -168,7 +168,7 @@ def test_double_helix_from_a_file(second, tmp_path):
         angle_step=2 * math.pi / 120,
         z_step=1.0 / 120,
         second=second,
-        **panel_of(1.0, 91),
+        **detector_of(1.0, 91),
     )
     scan = clra.Scan(BODY.line_integrals(geometry), geometry)
     write_scan(tmp_path / "double.nxs", scan)
@@ -266,9 +266,9 @@ def test_what_katsevich_cannot_treat():
         message = _refused(short, **options)
         assert "Tam-Danielsson" in message and "pitch of at most" in message
         assert "expected rows" in message and "field of view of at most" in message
-    panel = panel_of(1.0, 91)
-    assert "expected a helix" in _refused(clra.circular(30, **panel))
-    assert "at most 6" in _refused(clra.space_filling(90, z_step=0.01, **panel))
+    detector = detector_of(1.0, 91)
+    assert "expected a helix" in _refused(clra.circular(30, **detector))
+    assert "at most 6" in _refused(clra.space_filling(90, z_step=0.01, **detector))
     wide = Ellipsoids([[0, 0, 0]], [[1.4, 1.4, 0.9]], [1.0])
     message = _refused(helix_of(), wide)
     assert "beyond the field of view of 2.1 mm" in message

@@ -35,9 +35,9 @@ def _spoilt(scan, value):
 
 
 @pytest.mark.parametrize("method", ["fbp", "osem-tr", "imgr"])
-def test_what_is_not_believed_does_not_matter(scan, method):
+def test_what_is_not_valid_views_does_not_matter(scan, method):
     volumes = [
-        clra.reconstruct(_spoilt(scan, value), method, believed=BELIEVED) for value in (0.0, 9.0)
+        clra.reconstruct(_spoilt(scan, value), method, valid_views=BELIEVED) for value in (0.0, 9.0)
     ]
     assert np.array_equal(*volumes)
     believing = clra.reconstruct(_spoilt(scan, 9.0), method)
@@ -72,7 +72,7 @@ def test_katsevich_puts_what_lies_between_in_place_of_them(scan, value):
     whole = clra.reconstruct(scan, "katsevich")
     spoilt = _spoilt(scan, value)  # 9 at the border would be a sample too wide
     with pytest.warns(UserWarning, match="katsevich needs every view: 3 of 121 that are missing"):
-        found = clra.reconstruct(spoilt, "katsevich", believed=BELIEVED)
+        found = clra.reconstruct(spoilt, "katsevich", valid_views=BELIEVED)
     used = clra.reconstruct(spoilt, "katsevich")
 
     def rms(volume):
@@ -98,9 +98,9 @@ def test_katsevich_takes_the_last_of_a_view_that_was_repeated(scan):
 
 
 def test_katsevich_says_what_lies_between_the_parts_of_a_broken_helix(scan):
-    panel = {"source_to_axis": 4.0, "source_to_detector": 8.0, "pixel_size": 0.06}
+    detector = {"source_to_axis": 4.0, "source_to_detector": 8.0, "pixel_size": 0.06}
     step = math.radians(5.9)
-    whole = clra.helix(260, angle_step=step, z_step=0.008, shape=scan.geometry.shape, **panel)
+    whole = clra.helix(260, angle_step=step, z_step=0.008, shape=scan.geometry.shape, **detector)
     broken = whole.subset(np.r_[:124, 136:260])
     grid = default_grid(broken)
     with pytest.warns(UserWarning, match=r"2 helices \(views 0 to 123, 124 to 247\)") as said:
@@ -115,8 +115,8 @@ def test_katsevich_says_what_lies_between_the_parts_of_a_broken_helix(scan):
 
 
 @pytest.mark.parametrize(
-    "believed", [np.ones(7, np.bool_), np.zeros(121, np.bool_), np.ones(121, np.intp)]
+    "valid_views", [np.ones(7, np.bool_), np.zeros(121, np.bool_), np.ones(121, np.intp)]
 )
-def test_choices_that_are_none(scan, believed):
-    with pytest.raises(ValueError, match="believed: found"):
-        clra.reconstruct(scan, believed=believed)
+def test_choices_that_are_none(scan, valid_views):
+    with pytest.raises(ValueError, match="valid_views: found"):
+        clra.reconstruct(scan, valid_views=valid_views)

@@ -84,7 +84,7 @@ def test_columns_are_the_derivatives_of_what_moved_points_look_like(scan, points
     np.testing.assert_allclose(found, expected, atol=DIFFERENCE * np.abs(expected).max())
 
 
-def test_columns_of_panels_in_general_position(points):
+def test_columns_of_detectors_in_general_position(points):
     random = np.random.default_rng(1)
     ideal = circular(4, **STAGE).to_astra()
     tilted = ConeBeamGeometry.from_astra(

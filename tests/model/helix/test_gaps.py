@@ -6,7 +6,7 @@ import pytest
 import clra
 from clra.model.helix.gaps import completed
 
-PANEL = {
+DETECTOR = {
     "source_to_axis": 30.0,
     "source_to_detector": 61.0,
     "pixel_size": 0.5,
@@ -16,7 +16,7 @@ FIELDS = ("source", "detector", "u", "v")
 
 
 def _helix(step=0.03, z_step=0.05, views=90, **more):
-    return clra.helix(views, angle_step=step, z_step=z_step, **PANEL, **more)
+    return clra.helix(views, angle_step=step, z_step=z_step, **DETECTOR, **more)
 
 
 def _without(geometry, missing):
@@ -36,7 +36,7 @@ def _is(found, expected):
         (_helix(step=-0.03, start=2.0), [1, 88]),
         (_helix(z_step=-0.05, start=3.1), [3, 4]),  # across half a turn
         (_helix(step=0.1), [11, 30]),
-        (clra.double_helix(60, angle_step=0.03, z_step=0.05, **PANEL), [20, 80, 81]),
+        (clra.double_helix(60, angle_step=0.03, z_step=0.05, **DETECTOR), [20, 80, 81]),
     ],
 )
 def test_what_is_missing_is_put_in(geometry, missing):
@@ -53,9 +53,9 @@ def test_what_is_missing_is_put_in(geometry, missing):
         _without(_helix(), range(40, 44)),  # 7 degrees
         _without(_helix(step=0.1), [20, 21]),
         _without(_helix(), [0, 89]),
-        _without(clra.circular(60, **PANEL), [30]),
-        clra.space_filling(90, z_step=0.01, **PANEL),
-        clra.double_helix(60, angle_step=0.03, z_step=0.05, **PANEL),
+        _without(clra.circular(60, **DETECTOR), [30]),
+        clra.space_filling(90, z_step=0.01, **DETECTOR),
+        clra.double_helix(60, angle_step=0.03, z_step=0.05, **DETECTOR),
         _helix(views=1),
         _helix(views=2),
     ],

@@ -1,4 +1,5 @@
-"""Curves on the panel against the shadows of the helix itself; fits against what was put in."""
+"""Curves on the detector against the projections of the helix itself; fits against what was put
+in."""
 
 import math
 
@@ -13,7 +14,7 @@ from clra.model.helix.helix import Helix
 from clra.model.helix.pi_intervals import field_of_view, pi_reach, pi_spans
 
 PIXELS = 1e-9
-PANEL = {
+DETECTOR = {
     "source_to_axis": 30.0,
     "source_to_detector": 61.0,
     "pixel_size": 0.5,
@@ -37,7 +38,7 @@ def helix(z_step: float = 0.05, pitch_v: float = 0.4, pitch_u: float = 0.5) -> H
     )
 
 
-def shadows(one: Helix, view: int, ahead: np.ndarray) -> np.ndarray:
+def projections(one: Helix, view: int, ahead: np.ndarray) -> np.ndarray:
     """Pixels (column, row) of helix positions an angle ahead of a view's source."""
     b = one.start + view * one.angle_step + ahead
     z = one.z + view * one.z_step + ahead * one.z_step / one.angle_step
@@ -51,7 +52,7 @@ HELICES = [helix(), helix(z_step=-0.05), helix(pitch_v=-0.4), helix(pitch_u=-0.5
 @pytest.mark.parametrize("one", HELICES)
 def test_window_is_the_shadow_of_the_next_turns(one):
     for border, ahead in enumerate([np.linspace(2.2, 4.0, 7), -np.linspace(2.2, 4.0, 7)]):
-        column, row = shadows(one, 60, ahead).T
+        column, row = projections(one, 60, ahead).T
         expected = one.row(one.window(one.tangent_u(column))[border])
         np.testing.assert_allclose(row, expected, atol=PIXELS)
 
@@ -59,9 +60,9 @@ def test_window_is_the_shadow_of_the_next_turns(one):
 @pytest.mark.parametrize("one", HELICES)
 @pytest.mark.parametrize("psi", [-1.7, -0.4, 0.2, 1.1, 1.8])
 def test_kappa_lines_meet_the_helix_twice(one, psi):
-    column, row = shadows(one, 60, np.array([psi, 2 * psi])).T
+    column, row = projections(one, 60, np.array([psi, 2 * psi])).T
     first, second = one.kappa_line(psi)
-    # A point of the helix behind the source's plane has its shadow on the line as well.
+    # A point of the helix behind the source's plane has its projection on the line as well.
     seen = np.isfinite(column)
     assert seen.any() or abs(psi) < 0.8
     expected = one.row(first + second * one.tangent_u(column[seen]))
@@ -131,7 +132,7 @@ def test_fit_finds_the_helix(one):
 
 @pytest.mark.parametrize("second", ["half-turn", "return"])
 def test_fit_finds_both_helices(second):
-    geometry = clra.double_helix(50, angle_step=0.05, z_step=0.02, second=second, **PANEL)
+    geometry = clra.double_helix(50, angle_step=0.05, z_step=0.02, second=second, **DETECTOR)
     (first, one), (later, other) = fit_helices(geometry)
     assert (first, later) == (slice(0, 50), slice(50, 100))
     assert one.z_step == pytest.approx(-other.z_step)
@@ -139,7 +140,7 @@ def test_fit_finds_both_helices(second):
 
 
 def _moved(view: int, distance: float) -> ConeBeamGeometry:
-    straight = clra.helix(40, angle_step=0.05, z_step=0.02, **PANEL)
+    straight = clra.helix(40, angle_step=0.05, z_step=0.02, **DETECTOR)
     detector = straight.detector.copy()
     detector[view] += distance * straight.u[view]
     return ConeBeamGeometry(
@@ -152,21 +153,26 @@ def _moved(view: int, distance: float) -> ConeBeamGeometry:
 
 
 def test_sixty_views_a_turn_are_enough():
-    panel = {"source_to_axis": 4.0, "source_to_detector": 8.0, "pixel_size": 0.1, "shape": (9, 9)}
-    helix = clra.helix(120, angle_step=2 * math.pi / 60, z_step=0.05, **panel)
+    detector = {
+        "source_to_axis": 4.0,
+        "source_to_detector": 8.0,
+        "pixel_size": 0.1,
+        "shape": (9, 9),
+    }
+    helix = clra.helix(120, angle_step=2 * math.pi / 60, z_step=0.05, **detector)
     assert len(fit_helices(helix)) == 1
 
 
 def test_what_is_no_helix():
-    circle = clra.circular(40, **PANEL)
+    circle = clra.circular(40, **DETECTOR)
     with pytest.raises(ValueError, match=r"no rise .* expected a helix"):
         fit_helices(circle)
     with pytest.raises(ValueError, match=r"found 15.* degrees from view to view, .* at most 6"):
-        fit_helices(clra.space_filling(400, z_step=0.01, **PANEL))
+        fit_helices(clra.space_filling(400, z_step=0.01, **DETECTOR))
     with pytest.raises(ValueError, match=r"view 17 is 0.9.* pixels off .* at most 0.1"):
         fit_helices(_moved(17, 1.0))
     fit_helices(_moved(17, 0.05))
-    stopped = clra.helix(40, angle_step=0.05, z_step=0.02, **PANEL)
+    stopped = clra.helix(40, angle_step=0.05, z_step=0.02, **DETECTOR)
     with pytest.raises(ValueError, match="view 39 continues no helix"):
         fit_helices(stopped.subset([*range(39), 3]))
 
@@ -175,8 +181,8 @@ def test_a_field_that_fits_and_advice_that_helps():
     grid = VolumeGrid(shape=(9, 40, 40), voxel_size=0.2)
 
     def one(z_step, rows=41, pixel=0.5):
-        panel = PANEL | {"shape": (rows, 33), "pixel_size": pixel}
-        return fit_helices(clra.helix(99, angle_step=0.05, z_step=z_step, **panel))[0][1]
+        detector = DETECTOR | {"shape": (rows, 33), "pixel_size": pixel}
+        return fit_helices(clra.helix(99, angle_step=0.05, z_step=z_step, **detector))[0][1]
 
     assert field_of_view([one(0.03)], grid) == one(0.03).field_radius
     with pytest.raises(ValueError, match="less than the Tam-Danielsson window") as caught:
@@ -201,7 +207,7 @@ def test_a_pitch_too_small_for_the_rows():
 
     def one(pitch):
         steps = {"angle_step": 0.05, "z_step": pitch * 0.05 / (2 * math.pi)}
-        return fit_helices(clra.helix(150, **steps, **PANEL))[0][1]
+        return fit_helices(clra.helix(150, **steps, **DETECTOR))[0][1]
 
     with pytest.raises(
         ValueError, match="window of 2 rows, expected a pitch of at least"

@@ -19,8 +19,8 @@ def rays(geometry, view):
     """Unit directions of the rays to all pixels, (rows, columns, 3)."""
     i = np.arange(geometry.columns) - (geometry.columns - 1) / 2
     j = np.arange(geometry.rows)[:, None, None] - (geometry.rows - 1) / 2
-    panel = geometry.detector[view] + i[:, None] * geometry.u[view] + j * geometry.v[view]
-    ray = panel - geometry.source[view]
+    detector = geometry.detector[view] + i[:, None] * geometry.u[view] + j * geometry.v[view]
+    ray = detector - geometry.source[view]
     return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
 
 
@@ -88,7 +88,7 @@ def test_a_range_of_views_is_that_part_of_all():
 
 
 @pytest.mark.parametrize("oversample", [2, 3])
-def test_oversampling_is_the_mean_of_a_finer_panel(oversample):
+def test_oversampling_is_the_mean_of_a_finer_detector(oversample):
     geometry, cloud = tilted(4), porous(3.0, 6.0, seed=2, count=30)
     rows, columns = geometry.shape
     fine = ConeBeamGeometry(

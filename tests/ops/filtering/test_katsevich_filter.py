@@ -33,7 +33,7 @@ HELICES = [
     dataclasses.replace(BASE, z_step=-0.11),
     dataclasses.replace(BASE, angle_step=-0.07, pitch_v=-0.8),
     dataclasses.replace(BASE, pitch_u=-0.7, principal=(18.8, 22.1)),
-    # a panel much taller than the window, and wider than the field of view
+    # a detector much taller than the window, and wider than the field of view
     dataclasses.replace(BASE, z_step=0.04, shape=(43, 46), principal=(17.0, 18.0)),
 ]
 

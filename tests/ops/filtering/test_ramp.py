@@ -15,7 +15,7 @@ INTENSITY = 0.01  # of a reconstructed sphere
 
 
 def scanner(views: int = 3, shape: tuple[int, int] = (5, 13)) -> ConeBeamGeometry:
-    """Circle with a wide cone, every view with a panel of its own, off its principal point."""
+    """Circle with a wide cone, every view with a detector of its own, off its principal point."""
     rng = np.random.default_rng(5)
     ideal = circular(
         views, source_to_axis=20.0, source_to_detector=60.0, pixel_size=1.5, shape=shape

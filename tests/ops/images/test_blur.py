@@ -12,7 +12,7 @@ ROUNDING = 2e-6  # of values around 1
 
 @pytest.mark.parametrize("lanes", [8, 2])
 @pytest.mark.parametrize(("shape", "sigma"), [((23, 37), 2.0), ((40, 16), 3.5), ((5, 70), 0.7)])
-def test_is_the_mean_of_what_lies_on_the_panel(context, queue, monkeypatch, shape, sigma, lanes):
+def test_is_the_mean_of_what_lies_on_the_detector(context, queue, monkeypatch, shape, sigma, lanes):
     monkeypatch.setattr("clra.ops.images.blur.lanes", lambda context: lanes)
     images = np.random.default_rng(0).normal(size=(2, *shape))
     image = to_device(context, np.stack([lined(i) for i in images]))

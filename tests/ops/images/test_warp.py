@@ -78,7 +78,7 @@ def test_a_feature_goes_back_to_where_it_was(context, queue):
     np.testing.assert_allclose(at, q, atol=2e-3)
 
 
-def test_wide_panels_keep_the_fraction_of_a_pixel(context, queue):
+def test_wide_detectors_keep_the_fraction_of_a_pixel(context, queue):
     """A position of 6000 in single precision is 5e-4 wide."""
     columns, inner = 6000, slice(20, 5980)
     image = np.sin(np.arange(columns, dtype=float))

@@ -11,7 +11,12 @@ import clra
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops.projection.coverage import Coverage
 
-PANEL = {"source_to_axis": 60.0, "source_to_detector": 100.0, "pixel_size": 1.0, "shape": (38, 45)}
+DETECTOR = {
+    "source_to_axis": 60.0,
+    "source_to_detector": 100.0,
+    "pixel_size": 1.0,
+    "shape": (38, 45),
+}
 # Of the largest W: what linear interpolation between coarse voxels costs.
 TOLERANCE = 0.04
 
@@ -44,7 +49,7 @@ def _smooth_weight(rows):
 
 @pytest.mark.parametrize("order", ["zyx", "yxz"])
 def test_views_are_counted(context, queue, order):
-    geometry = clra.helix(90, angle_step=math.radians(11), z_step=0.3, **PANEL)
+    geometry = clra.helix(90, angle_step=math.radians(11), z_step=0.3, **DETECTOR)
     grid = VolumeGrid(shape=(31, 18, 21), voxel_size=0.7, centre=(0.4, -0.3, 1.0))
     weight = _smooth_weight(geometry.rows)
     expected = _counted(geometry, grid, weight)
@@ -58,15 +63,15 @@ def test_views_are_counted(context, queue, order):
 @pytest.mark.parametrize(
     ("rows", "planes"), [(1, 1), (2, 1), (3, 2), (3, 3), (5, 5), (9, 9), (38, 1), (38, 2), (38, 5)]
 )
-def test_all_views_count_where_grid_or_panel_is_thin(context, queue, rows, planes):
-    geometry = clra.circular(60, **(PANEL | {"shape": (rows, 45)}))
+def test_all_views_count_where_grid_or_detector_is_thin(context, queue, rows, planes):
+    geometry = clra.circular(60, **(DETECTOR | {"shape": (rows, 45)}))
     grid = VolumeGrid(shape=(planes, 17, 9), voxel_size=0.6)
     middle = _normalised(context, queue, geometry, grid, np.ones(rows))[planes // 2]
     assert np.allclose(1 / middle, 60, rtol=1e-5)
 
 
 def test_a_plane_at_the_end_of_the_field_of_view_is_counted(context, queue):
-    geometry = clra.circular(60, **PANEL)
+    geometry = clra.circular(60, **DETECTOR)
     grid = VolumeGrid(shape=(1, 18, 21), voxel_size=0.6, centre=(0.4, -0.3, 9.1))
     weight = _smooth_weight(geometry.rows)
     expected = _counted(geometry, grid, weight)
@@ -76,7 +81,7 @@ def test_a_plane_at_the_end_of_the_field_of_view_is_counted(context, queue):
 
 
 def test_views_count_by_their_weight(context, queue):
-    geometry = clra.helix(50, angle_step=math.radians(23), z_step=0.3, **PANEL)
+    geometry = clra.helix(50, angle_step=math.radians(23), z_step=0.3, **DETECTOR)
     grid = VolumeGrid(shape=(19, 10, 11), voxel_size=1.1)
     weight = np.random.default_rng(0).integers(0, 3, geometry.views)
     twice = np.repeat(np.arange(geometry.views), weight)  # as often as it weighs
@@ -87,7 +92,7 @@ def test_views_count_by_their_weight(context, queue):
 
 
 def test_a_slab_is_part_of_the_whole(context, queue):
-    geometry = clra.helix(50, angle_step=0.2, z_step=0.5, **PANEL)
+    geometry = clra.helix(50, angle_step=0.2, z_step=0.5, **DETECTOR)
     grid = VolumeGrid(shape=(29, 10, 11), voxel_size=0.9)
     weight = np.ones(geometry.rows)
     whole = _normalised(context, queue, geometry, grid, weight)
@@ -96,7 +101,7 @@ def test_a_slab_is_part_of_the_whole(context, queue):
 
 
 def test_outside_the_circle_that_all_views_see_is_zero(context, queue):
-    geometry = clra.circular(40, **PANEL)
+    geometry = clra.circular(40, **DETECTOR)
     radius = field_radii(geometry).min()
     grid = VolumeGrid(shape=(3, 61, 61), voxel_size=2.4 * radius / 61)
     volume = _normalised(context, queue, geometry, grid, np.ones(geometry.rows))
@@ -107,7 +112,7 @@ def test_outside_the_circle_that_all_views_see_is_zero(context, queue):
 
 
 def test_one_view_moved_far_does_not_narrow_the_field(context, queue):
-    geometry = clra.circular(100, **PANEL)
+    geometry = clra.circular(100, **DETECTOR)
     shift = np.zeros(100)
     shift[31] = 15.0
     moved = geometry.with_motion(clra.Motion(shift_u=shift, shift_v=0 * shift))
@@ -118,16 +123,16 @@ def test_one_view_moved_far_does_not_narrow_the_field(context, queue):
 
 
 def test_what_no_view_sees_is_zero(context, queue):
-    geometry = clra.circular(5, **PANEL)
+    geometry = clra.circular(5, **DETECTOR)
     grid = VolumeGrid(shape=(4, 3, 3), voxel_size=1.0, centre=(0, 0, 80.0))
     assert not _normalised(context, queue, geometry, grid, np.ones(geometry.rows)).any()
 
 
-def test_weights_must_fit_the_panel(context):
+def test_weights_must_fit_the_detector(context):
     with pytest.raises(ValueError, match=r"row_weight: found \(7,\), expected \(38,\)"):
         Coverage(
             context,
-            clra.circular(5, **PANEL),
+            clra.circular(5, **DETECTOR),
             VolumeGrid(shape=(2, 2, 2), voxel_size=1.0),
             np.ones(7),
         )
@@ -137,7 +142,7 @@ def test_weights_must_fit_the_views(context):
     with pytest.raises(ValueError, match=r"view_weight: found \(7,\), expected 5 finite numbers"):
         Coverage(
             context,
-            clra.circular(5, **PANEL),
+            clra.circular(5, **DETECTOR),
             VolumeGrid(shape=(2, 2, 2), voxel_size=1.0),
             np.ones(38),
             view_weight=np.ones(7),
@@ -145,7 +150,7 @@ def test_weights_must_fit_the_views(context):
 
 
 def test_a_volume_of_another_grid_is_refused(context, queue):
-    geometry = clra.circular(5, **PANEL)
+    geometry = clra.circular(5, **DETECTOR)
     coverage = Coverage(context, geometry, VolumeGrid(shape=(5, 6, 7), voxel_size=1.0), np.ones(38))
     coverage.compute(queue)
     with pytest.raises(ValueError, match=r"volume: found shape \(5, 7, 6\)"):

@@ -9,11 +9,11 @@ import pytest
 from arrays import with_offset
 from geometries import upside_down
 from projector_cases import (
+    DETECTOR,
     FORMS,
     GEOMETRIES,
     GRID,
     NARROW,
-    PANEL,
     all_forms,
     assert_close,
     back,
@@ -35,7 +35,7 @@ UNITS = 1e-5  # of the largest value
 
 
 def turned(geometry: ConeBeamGeometry, roll: float, pitch: float) -> ConeBeamGeometry:
-    """Panels rolled in their plane and tipped towards the source [degrees]."""
+    """Detectors rolled in their plane and tipped towards the source [degrees]."""
     a, b = np.radians([roll, pitch])
     u = math.cos(a) * geometry.u + math.sin(a) * geometry.v
     v = math.cos(a) * geometry.v - math.sin(a) * geometry.u
@@ -54,10 +54,10 @@ def joseph(geometry: ConeBeamGeometry, grid: VolumeGrid) -> np.ndarray:
     column = np.arange(geometry.columns) - (geometry.columns - 1) / 2
     row = np.arange(geometry.rows) - (geometry.rows - 1) / 2
     source, detector, u, v = (a[:, None, None] for a in np.split(geometry.to_astra(), 4, axis=1))
-    panel = detector + row[:, None, None] * v + column[:, None] * u
+    detector = detector + row[:, None, None] * v + column[:, None] * u
     first = np.array([axis[0] for axis in grid.coordinates()])
-    start = np.broadcast_to((source - first) / grid.voxel_size, panel.shape).reshape(-1, 3)
-    direction = (panel - source).reshape(-1, 3)
+    start = np.broadcast_to((source - first) / grid.voxel_size, detector.shape).reshape(-1, 3)
+    direction = (detector - source).reshape(-1, 3)
     sizes = np.array(grid.shape[::-1])
     matrix = np.zeros((len(start), *grid.shape))
     for p, q, w in (0, 1, 2), (1, 0, 2), (2, 0, 1):
@@ -124,10 +124,10 @@ def test_volumes_of_any_shape(queue, shape, form):
 @pytest.mark.parametrize("form", [FORMS["tilted"], NARROW["narrow tilted"]], ids=["", "narrow"])
 @pytest.mark.parametrize("pixel", [0.4, 0.9, 1.6])
 @pytest.mark.parametrize("roll, pitch", [(0, 15), (2, 0), (12, -5), (40, 0), (181, 1)])
-def test_panels_turned_any_way(queue, roll, pitch, pixel, form):
-    # lines long enough for whole vectors, which pass from none to many columns of the panel
-    panel = PANEL | {"pixel_size": pixel, "shape": (round(70 / pixel), 9)}
-    geometry = turned(circular(2, start=0.3, **panel), roll, pitch)
+def test_detectors_turned_any_way(queue, roll, pitch, pixel, form):
+    # lines long enough for whole vectors, which pass from none to many columns of the detector
+    detector = DETECTOR | {"pixel_size": pixel, "shape": (round(70 / pixel), 9)}
+    geometry = turned(circular(2, start=0.3, **detector), roll, pitch)
     grid = VolumeGrid(shape=(75, 5, 6), voxel_size=0.6, centre=(0.7, -0.4, 1.1))
     assert_all_exact(queue, geometry, grid, form)
 
@@ -136,8 +136,8 @@ def test_panels_turned_any_way(queue, roll, pitch, pixel, form):
 def test_lines_of_several_blocks(queue, monkeypatch, form):
     monkeypatch.setattr(projector, "_LINE", 64)
     monkeypatch.setattr(projector, "_ADJOINT_LINE", 64)
-    panel = PANEL | {"pixel_size": 1.9, "shape": (75, 7)}
-    geometry = perturbed(circular(3, start=0.5, **panel), 1.0 if "_tilted" in form else 0.0)
+    detector = DETECTOR | {"pixel_size": 1.9, "shape": (75, 7)}
+    geometry = perturbed(circular(3, start=0.5, **detector), 1.0 if "_tilted" in form else 0.0)
     grid = VolumeGrid(shape=(131, 4, 3), voxel_size=0.7)
     assert_all_exact(queue, geometry, grid, form)
 
@@ -157,7 +157,7 @@ def test_adjoint_by_inner_products(queue, name, form):
 def test_rays_along_the_very_edge_read_nothing_beyond_the_volume(queue, roll, form):
     """A ray on the line beside the last one counts for nothing; rounding may take it farther."""
     geometry = turned(
-        circular(1, start=1.8, **PANEL | {"shape": (37, 9), "pixel_size": 1.1}), roll, 0
+        circular(1, start=1.8, **DETECTOR | {"shape": (37, 9), "pixel_size": 1.1}), roll, 0
     )
     shape, size = (40, 60, 60), 0.6
     values = with_offset(queue, numbers(60, 60, 40), skip=4096)
@@ -177,7 +177,7 @@ def test_rays_along_the_very_edge_read_nothing_beyond_the_volume(queue, roll, fo
 
 @forms
 def test_rays_at_45_degrees_go_the_same_way_in_both_directions(queue, form):
-    geometry = circular(8, **PANEL)  # the middle column's rays advance alike along x and y
+    geometry = circular(8, **DETECTOR)  # the middle column's rays advance alike along x and y
     volume, projections = numbers(*GRID.shape), numbers(8, *geometry.shape)
     left = np.vdot(forward(queue, geometry, GRID, volume, **form), projections)
     right = np.vdot(volume, back(queue, geometry, GRID, projections, matched=True, **form))
@@ -190,8 +190,8 @@ SPHERES = Ellipsoids([[0, 0, 0], [9, -5, 4]], np.array([[20, 20, 20], [6, 6, 6]]
 @forms
 @pytest.mark.parametrize("tilt", [0.0, 1.0], ids=["axial", "tilted"])
 def test_spheres_have_their_line_integrals(queue, form, tilt):
-    panel = PANEL | {"pixel_size": 1.3, "shape": (60, 60)}
-    geometry = perturbed(helix(5, angle_step=1.3, z_step=3.0, **panel), tilt)
+    detector = DETECTOR | {"pixel_size": 1.3, "shape": (60, 60)}
+    geometry = perturbed(helix(5, angle_step=1.3, z_step=3.0, **detector), tilt)
     grid = VolumeGrid(shape=(69, 68, 67), voxel_size=0.65)
     found = forward(queue, geometry, grid, SPHERES.volume(grid, oversample=3), **form)
     expected = SPHERES.line_integrals(geometry, oversample=3)
@@ -248,7 +248,7 @@ def test_rows_upward_are_rows_downward_reversed(queue):
 
 
 def test_motion_in_the_geometry_moves_the_projections(queue):
-    geometry = circular(3, start=0.2, **PANEL)
+    geometry = circular(3, start=0.2, **DETECTOR)
     shifts = Motion(shift_u=[2, -1, 0], shift_v=[1, 0, -3])
     volume = numbers(*GRID.shape)
     still = forward(queue, geometry, GRID, volume)

@@ -5,9 +5,9 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 import pytest
 from projector_cases import (
+    DETECTOR,
     GEOMETRIES,
     GRID,
-    PANEL,
     assert_close,
     back,
     forms,
@@ -42,7 +42,7 @@ def test_set_geometry_is_a_new_operator(queue):
 
 @forms
 def test_a_view_that_misses_the_volume_gives_nothing(queue, form):
-    geometry = circular(1, **PANEL)
+    geometry = circular(1, **DETECTOR)
     grid = VolumeGrid(shape=(9, 8, 7), voxel_size=1.0, centre=(0.0, 0.0, 60.0))
     assert not forward(queue, geometry, grid, numbers(*grid.shape), **form).any()
     projections = numbers(1, *geometry.shape)

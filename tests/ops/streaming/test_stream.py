@@ -12,7 +12,7 @@ from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
-PANEL = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
+DETECTOR = {"source_to_axis": 50.0, "source_to_detector": 100.0, "pixel_size": 1.0}
 
 
 def test_chunks_cover_all_views_within_the_budget():
@@ -61,7 +61,7 @@ def test_volume_keeps_its_slabs(budget):
 
 @pytest.mark.parametrize("host", [None, 40 << 10])
 def test_binned_radiographs_are_means(host):
-    geometry = clra.circular(80, shape=(29, 42), **PANEL)
+    geometry = clra.circular(80, shape=(29, 42), **DETECTOR)
     pixels = np.random.default_rng(1).random((80, 29, 42), np.float32)
     stream = Stream(max_host_memory=host)
     radiographs = Radiographs(stream, clra.Scan(pixels, geometry), 4)
@@ -79,7 +79,7 @@ def test_full_resolution_is_read_where_needed():
             Counting.read += 1
             return np.zeros((views.stop - views.start, 4, 5), np.float32)
 
-    scan = clra.Scan(Counting(), clra.circular(6, shape=(4, 5), **PANEL))
+    scan = clra.Scan(Counting(), clra.circular(6, shape=(4, 5), **DETECTOR))
     radiographs = Radiographs(Stream(), scan, 1)
     assert Counting.read == 0
     radiographs.read(slice(2, 4))
@@ -89,7 +89,7 @@ def test_full_resolution_is_read_where_needed():
 @pytest.mark.parametrize("budget", [None, 40 << 10])
 def test_a_device_with_its_own_memory_gets_copies(budget, monkeypatch):
     """As on a GPU: radiographs are copied on a queue beside the one that works on them."""
-    geometry = clra.circular(60, shape=(12, 16), **PANEL)
+    geometry = clra.circular(60, shape=(12, 16), **DETECTOR)
     grid = VolumeGrid(shape=(9, 10, 11), voxel_size=0.5)
     pixels = np.random.default_rng(2).random((60, 12, 16), np.float32)
     volumes = []
