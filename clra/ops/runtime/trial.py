@@ -35,7 +35,7 @@ kernel void vectors(global float *out, global const int *in)
     const int i = get_global_id(0);
     const float16 x = convert_float16(vload16(i, in));
     const float8 y = convert_float8(convert_long8(vload8(2 * i, in)));
-    const float8 z = convert_float8(convert_ushort8_sat(vload8(2 * i + 1, in)));
+    const float8 z = convert_float8(convert_uchar8_sat(vload8(2 * i + 1, in)));
     vstore16(fma(x, (float16)(0.5f), floor(x * 0.3f)), 2 * i, out);
     vstore16((float16)(convert_float8(convert_int8_rtz(y * 0.7f)), z), 2 * i + 1, out);
 }
@@ -63,7 +63,7 @@ Case = Callable[[cl.CommandQueue], tuple[Floats, Floats]]
 
 def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     """Conversions and arithmetic in vectors of 8 and 16, and numpy's."""
-    numbers = np.random.default_rng(0).integers(-90_000, 90_000, (64, 16), np.int32)
+    numbers = np.random.default_rng(0).integers(-500, 500, (64, 16), np.int32)
     program = _program(queue)
     out = cl_array.empty(queue, (64, 32), np.float32)
     given = cl_array.to_device(queue, numbers)
@@ -72,7 +72,7 @@ def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     single = numbers.astype(np.float32)
     sums = single.astype(np.float64) * 0.5 + np.floor(single * np.float32(0.3))
     truncated = np.trunc(single[:, :8] * np.float32(0.7))
-    clipped = np.clip(numbers[:, 8:], 0, 65535)
+    clipped = np.clip(numbers[:, 8:], 0, 255)
     return out.get().astype(np.float64), np.hstack([sums, truncated, clipped])
 
 
