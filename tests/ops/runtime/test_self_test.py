@@ -123,9 +123,9 @@ VARIANT_OF_HASWELL = {"sse2"} | next(flags for _, cpu, flags in pocl.VARIANTS if
 
 def test_another_device_stands_in_unless_one_was_asked_for(monkeypatch, two):
     replace_trials(monkeypatch, [ABORTS, RIGHT])
-    with pytest.warns(ClraWarning, match="fails clra's self-test.*: other .* is used instead"):
+    with pytest.warns(ClraWarning, match=r"fails clra's self-test.*: other .* is used instead"):
         assert devices.usable_device() is two[1][1]
-    with pytest.raises(DeviceError, match="fails clra's self-test.*choose another with --device"):
+    with pytest.raises(DeviceError, match=r"fails clra's self-test.*choose another with --device"):
         devices.usable_device("0:0")
     monkeypatch.setenv("CLRA_DEVICE", "0:0")
     with pytest.raises(DeviceError, match="fails clra's self-test"):
