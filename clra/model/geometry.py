@@ -178,13 +178,8 @@ class ConeBeamGeometry:
         if motion.views != self.views:
             raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
-            return ConeBeamGeometry(
-                source=self.source + self.source_displacement(motion),
-                detector=self.detector,
-                u=self.u,
-                v=self.v,
-                shape=self.shape,
-            )
+            source = self.source + self.source_displacement(motion)
+            return ConeBeamGeometry(source, self.detector, self.u, self.v, self.shape)
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]
         detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v

@@ -2,20 +2,19 @@
 
 import json
 import re
-import subprocess
 import sys
 
 import pytest
 
 import clra
 from clra.app import cli
-from clra.errors import ClraWarning, DeviceError
-from clra.ops.runtime import cache_folder, devices, pocl, self_test, trial
+from clra.errors import DeviceError
+from clra.ops.runtime import devices, pocl, self_test, trial
 
 ABORTS = "import os, sys; print('LLVM ERROR: Cannot select: FILD', file=sys.stderr); os.abort()"
 HANGS = "import time; time.sleep(600)"
-WRONG = "print('{\"failure\": \"vectors: wrong numbers, off by 0.5 of the largest\", \"rate\": null}')"
-RIGHT = "print('{\"failure\": \"\", \"rate\": null}')"
+WRONG = 'print(\'{"failure": "vectors: wrong numbers, off by 0.5 of the largest", "rate": null}\')'
+RIGHT = 'print(\'{"failure": "", "rate": null}\')'
 CRASHES = "import ctypes; ctypes.string_at(0)"
 BROKEN = {
     "aborts": (ABORTS, r"ended by SIGABRT \(LLVM ERROR: Cannot select: FILD\)"),
@@ -77,7 +76,9 @@ def test_what_does_not_build_is_a_failure(queue, monkeypatch, name, kernel, defe
     monkeypatch.setattr(
         clra.kernels,
         "source",
-        lambda file: source(file) + "\nthis is no C;" if file.startswith("forward") else source(file),
+        lambda file: (
+            source(file) + "\nthis is no C;" if file.startswith("forward") else source(file)
+        ),
     )
     assert re.match(r"forward projection: kernel forward.* does not build", trial.failure(queue))
 
