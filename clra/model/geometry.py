@@ -179,7 +179,9 @@ class ConeBeamGeometry:
             raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
             source = self.source + self.source_displacement(motion)
-            return ConeBeamGeometry(source, self.detector, self.u, self.v, self.shape)
+            return ConeBeamGeometry(
+                source=source, detector=self.detector, u=self.u, v=self.v, shape=self.shape
+            )
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]
         detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v
