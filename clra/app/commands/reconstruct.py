@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from clra.methods.reconstruction.imgr_state import Step
+    from clra.methods.reconstruction.imgr_state import ImgrStep
     from clra.model.grid import VolumeGrid
     from clra.model.motion import Motion
     from clra.model.scan import Scan
@@ -133,7 +133,7 @@ def reconstruct(
         opened, known, valid_views = motion_for(opened, motion, reading.geometry())
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
-    steps: tuple[Step, ...] = ()
+    steps: tuple[ImgrStep, ...] = ()
     with console.progress() as progress:
         if method == "imgr":
             steps = _imgr(
@@ -195,7 +195,7 @@ def _imgr(
     console: Console,
     progress: "ProgressCallback",
     limits: dict[str, Any],
-) -> "tuple[Step, ...]":
+) -> "tuple[ImgrStep, ...]":
     """Reconstruct by multigrid iteration, keep what Ctrl-C leaves, or go on from there."""
     import numpy as np
 
