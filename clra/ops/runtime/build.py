@@ -79,7 +79,8 @@ def builds(context: cl.Context) -> Builds:
 
 def _compile(context: cl.Context, name: str, options: Sequence[str]) -> cl.Program:
     # pyopencl's public build() adds an include path, which breaks several drivers where it holds a
-    # blank, and a binary cache that outlives driver updates; drivers cache by themselves.
+    # blank, and a binary cache that outlives driver updates; drivers cache by themselves. The class
+    # is private: pyproject.toml bounds the version, and a test builds with it.
     program = cl._cl._Program(context, kernels.source(name))
     try:
         program.build(" ".join((*options, *pocl.build_options(context.devices))).encode())

@@ -1,8 +1,10 @@
 """Builds and argument checks."""
 
+import re
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
@@ -51,6 +53,14 @@ def test_threads_compile_once(context, monkeypatch):
         programs = list(pool.map(lambda one: one.program("warp.cl"), held))
     assert compiled == ["warp.cl"]
     assert len(set(map(id, programs))) == 1
+
+
+def test_the_private_class_of_pyopencl_is_that_of_the_versions_allowed():
+    project = Path(__file__).parents[3] / "pyproject.toml"
+    below = re.search(r'"pyopencl>=[\d.]+,<(\d+)"', project.read_text())
+    assert below is not None
+    assert pyopencl.VERSION[0] < int(below[1])
+    assert {"build", "all_kernels"} <= set(dir(cl._cl._Program))
 
 
 def test_a_kernel_that_does_not_compile_raises_with_the_log(context, monkeypatch):
