@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from clra.progress import ProgressCallback
 
 
+ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
+
+
 @dataclass(frozen=True)
 class Console:
     """How a command was asked to work and to speak."""

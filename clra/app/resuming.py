@@ -17,7 +17,7 @@ from clra.io.motion_file import read_motion_file, write_motion_file
 from clra.io.scan_files import scan_checksum
 from clra.io.volumes.volume_files import open_volume, read_volume
 from clra.methods.alignment.reprojection import with_margin
-from clra.methods.reconstruction.imgr_state import ImgrState, Step
+from clra.methods.reconstruction.imgr_state import ImgrState, ImgrStep
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.model.schedule import level_factor
@@ -108,7 +108,7 @@ class SavedState:
         if file.attributes.get("settings") != self._settings:
             found = file.attributes.get("settings", "none")
             raise InputError.at(path, "/@settings", found, self._settings)
-        steps = tuple(Step(**step) for step in json.loads(file.attributes["steps"]))
+        steps = tuple(ImgrStep(**step) for step in json.loads(file.attributes["steps"]))
         level = level_factor(steps[-1].level)
         wide = with_margin(grid)
         wide = wide.binned(level) if level > 1 else wide

@@ -221,4 +221,4 @@ def _read_history(file: h5py.File) -> dict[str, NDArray[Any]]:
 
 def _cause(group: h5py.Group) -> str:
     """Cause of a motion; files of version 0.1.0 call the detector a panel."""
-    return text(group.attrs.get("cause", "detector")).replace("panel", "detector")
+    return text(group.attrs.get("cause", "detector")).replace("panel", "detector")  # 0.1.0

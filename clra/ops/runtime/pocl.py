@@ -124,6 +124,11 @@ def cpu_of_variant(flags: frozenset[str]) -> str | None:
     return next((cpu for _, cpu, needed in VARIANTS if needed <= flags), None)
 
 
+def covered(cpus: Sequence[str], flags: frozenset[str]) -> list[str]:
+    """Those of some CPU names whose features a CPU of such flags has."""
+    return [name for name in cpus for _, cpu, needed in VARIANTS if cpu == name and needed <= flags]
+
+
 @cache
 def cpu_flags() -> frozenset[str]:
     """Features of the CPU as Linux lists them; none elsewhere."""
