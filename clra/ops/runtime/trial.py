@@ -24,6 +24,7 @@ from clra.model.trajectory import circular
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
 from clra.ops.runtime import build, devices, pocl, self_test
+from clra.ops.runtime.kernel import work_group_size
 
 # Of the largest value: float32 rounding stays below 1e-6; a registration is exact to 1.6e-3.
 TOLERANCE, REGISTRATION_TOLERANCE = 1e-4, 3e-3
@@ -79,7 +80,7 @@ def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
 def running_sums(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     """Cumulative sums over work-groups, through local memory."""
     kernel: Any = cl.Kernel(_program(queue), "running_sums")
-    (size,) = build.work_group_size(kernel, queue.device, (32,))
+    (size,) = work_group_size(kernel, queue.device, (32,))
     numbers = np.arange(3 * size, dtype=np.int32) % 7
     out = cl_array.empty(queue, numbers.shape, np.float32)
     given = cl_array.to_device(queue, numbers)
