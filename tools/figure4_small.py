@@ -1,4 +1,4 @@
-"""The paper's Figures 4 and 5 in small: align a double-helix scan of wood, reconstruct it exactly.
+"""The paper's Figures 4 and 5 scaled down: align a double helix, reconstruct exactly.
 
 ``python tools/figure4_small.py --scale 16 -o FOLDER`` takes two minutes on two cores, ``--scale 8``
 half an hour. The scan is the paper's in proportion: 14136 views of 3040 x 3040 pixels over the

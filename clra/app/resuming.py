@@ -16,7 +16,7 @@ from clra.io.alignment_file import read_alignment, write_alignment
 from clra.io.volumes.volume_files import open_volume, read_volume
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentResult
-from clra.methods.reconstruction.imgr_state import ImgrState, Step
+from clra.methods.reconstruction.imgr_state import ImgrState, ImgrStep
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.model.schedule import level_factor
@@ -106,7 +106,7 @@ class SavedState:
         if file.about.get("settings") != self._settings:
             found = file.about.get("settings", "none")
             raise InputError.at(path, "/@settings", found, self._settings)
-        steps = tuple(Step(**step) for step in json.loads(file.about["steps"]))
+        steps = tuple(ImgrStep(**step) for step in json.loads(file.about["steps"]))
         level = level_factor(steps[-1].level)
         wide = with_margin(grid)
         wide = wide.binned(level) if level > 1 else wide

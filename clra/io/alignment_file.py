@@ -18,7 +18,7 @@ from clra.findings import Finding
 from clra.io.atomic import atomic_path
 from clra.io.hdf5 import find, open_hdf5, require, text
 from clra.methods.alignment import quality as quality_module
-from clra.methods.alignment.result import AlignmentResult, Iteration, Quality
+from clra.methods.alignment.result import AlignmentResult, Iteration, SupportsAsDict
 from clra.model.motion import Motion
 
 Floats = NDArray[np.float64]
@@ -278,7 +278,7 @@ class _Values:
         return dict(self.values)
 
 
-def _quality(values: Any) -> Quality | None:
+def _quality(values: Any) -> SupportsAsDict | None:
     if not isinstance(values, Mapping):
         return None
     restore = getattr(quality_module.Quality, "from_dict", _Values)
@@ -287,4 +287,4 @@ def _quality(values: Any) -> Quality | None:
 
 def _cause(group: h5py.Group) -> str:
     """Cause of a motion; files of version 0.1.0 call the detector a panel."""
-    return text(group.attrs.get("cause", "detector")).replace("panel", "detector")
+    return text(group.attrs.get("cause", "detector")).replace("panel", "detector")  # 0.1.0

@@ -178,12 +178,9 @@ class ConeBeamGeometry:
         if motion.views != self.views:
             raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
+            source = self.source + self.source_displacement(motion)
             return ConeBeamGeometry(
-                source=self.source + self.source_displacement(motion),
-                detector=self.detector,
-                u=self.u,
-                v=self.v,
-                shape=self.shape,
+                source=source, detector=self.detector, u=self.u, v=self.v, shape=self.shape
             )
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]

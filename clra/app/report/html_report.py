@@ -256,9 +256,10 @@ def _quality(quality: Quality) -> str:
             "alignment is noise and what the reconstruction cannot do. Sharpness: mean squared "
             "gradient inside the field of view, relative to before; noise counts as sharp, too. "
             "Half scans: every view is registered with two volumes, from the even and from the "
-            "odd views; how far they differ is how well the data hold the shifts. In simulations "
-            "it was 0.02 to 0.05 pixel with the true motion and 0.04 to 0.11 when each view was "
-            "0.25 pixel off; what both halves share, as a movement of the sample, it cannot show."
+            "odd-numbered views; how far they differ is how well the data hold the shifts. In "
+            "simulations it was 0.02 to 0.05 pixel with the true motion and 0.04 to 0.11 when "
+            "each view was 0.25 pixel off; what both halves share, as a movement of the sample, it "
+            "cannot show."
         ),
         page.paragraph(f"Measured with radiographs binned by {quality.level}."),
     )

@@ -33,7 +33,7 @@ from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.model.view_matching import match_views
+from clra.model.view_selection import match_views
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, SMALLEST
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream

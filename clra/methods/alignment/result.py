@@ -84,7 +84,7 @@ class Iteration:
         )
 
 
-class Quality(Protocol):
+class SupportsAsDict(Protocol):
     """What is known of how far an alignment can be trusted; plain values describe it."""
 
     def as_dict(self) -> dict[str, Any]:
@@ -117,7 +117,7 @@ class AlignmentResult:
         RMS [pixel] of the part of the last estimate that each movement of the sample as a whole
         explains. The data hardly see that part; the volume is as sharp with it as without. With
         ``gauge="anchored"`` it is not in `motion` any more.
-    quality : Quality, optional
+    quality : SupportsAsDict, optional
         How far to trust it, where that was measured.
     warnings : tuple of Finding
         What was found on the way that tells against the result or the scan.
@@ -144,7 +144,7 @@ class AlignmentResult:
     sigma: Floats
     history: tuple[Iteration, ...] = ()
     gauge: Mapping[str, float] = field(default_factory=dict)
-    quality: Quality | None = None
+    quality: SupportsAsDict | None = None
     warnings: tuple[Finding, ...] = ()
     volume: NDArray[np.float32] | None = None
     method: str = ""

@@ -23,7 +23,7 @@ from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.validation import believed_views
-from clra.ops.runtime.devices import choose_devices
+from clra.ops.runtime.devices import usable_devices
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import HostPlanes, PlaneWriter
@@ -162,7 +162,7 @@ def reconstruct_into(
     motion = None if motion is None else motion.about(*scan.window_offset)
     scan = scan.cropped()
     grid = grid or default_grid(scan.geometry)
-    devices = choose_devices(device)
+    devices = usable_devices(device, progress)
     limits: dict[str, Any] = {
         "max_device_memory": max_device_memory,
         "max_host_memory": max_host_memory,

@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from clra.app.report.comparison import Comparison, Match, Pair
+from clra.app.report.comparison import Comparison, MatchedView, Pair
 from clra.app.report.html_report import render, write_report
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
@@ -49,7 +49,7 @@ def comparison() -> Comparison:
         return Pair(image, 2 * image)
 
     measured = pair(41, 33)
-    match = Match(11, "farthest moved", measured.before, measured.after, pair(41, 33))
+    match = MatchedView(11, "farthest moved", measured.before, measured.after, pair(41, 33))
     return Comparison(pair(33, 33), pair(40, 33), pair(8, 8), 0.005, "a method", (match,), 0.01)
 
 
