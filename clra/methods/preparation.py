@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,36 +21,21 @@ _VIEWS, _FEWEST_VIEWS, _PIXELS = 60, 16, 60e6
 _MOST = 0.2
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """A scan whose defects are known.
-
-    Attributes
-    ----------
-    scan : Scan
-        With its :class:`Corrections`, which are made as it is read.
-    findings : tuple of Finding
-        What was found, for users.
-    """
-
-    scan: Scan
-    findings: tuple[Finding, ...]
-
-
 def prepared(
     scan: Scan,
     options: CorrectionOptions | None = None,
     *,
     progress: ProgressCallback | None = None,
-) -> Prepared:
-    """Find the defects of a scan.
+) -> Scan:
+    """Return a scan with corrections for the defects that its radiographs have.
 
-    A scan that has its corrections already is returned as it is.
+    What is found is issued as findings (:meth:`clra.findings.Finding.warn`).
 
     Parameters
     ----------
     scan : Scan
-        At most 60 of its radiographs are read, one after another.
+        At most 60 of its radiographs are read, one after another. A scan that has its corrections
+        already is returned as it is.
     options : CorrectionOptions, optional
         What to look for; by default the defaults of these.
     progress : callable, optional
@@ -58,13 +43,13 @@ def prepared(
 
     Returns
     -------
-    Prepared
+    Scan
+        The corrections are made as it is read.
     """
     options = options or CorrectionOptions()
-    if scan.corrections is not None or options == CorrectionOptions.none():
-        return Prepared(scan, ())
+    if scan.corrections is not None:
+        return scan
     corrections = Corrections(zingers=options.zingers)
-    findings: list[Finding] = []
     if options.bad_pixels and scan.views >= FEWEST:
         statistics = DetectorStatistics(scan.geometry.shape)
         views = sample_of_views(scan)
@@ -73,10 +58,16 @@ def prepared(
             statistics.add(scan.read(view, view + 1)[0])
         found = statistics.find()
         tell(progress, "looking for bad pixels", len(views), len(views))
-        findings += bad_pixel_findings(found)
+        for finding in bad_pixel_findings(found):
+            finding.warn()
         if found.bad.any() and found.bad.mean() <= _MOST:
             corrections = replace(corrections, bad=found.bad)
-    return Prepared(replace(scan, corrections=corrections), tuple(findings))
+    return replace(scan, corrections=corrections)
+
+
+def with_detector_of(scan: Scan, other: Scan) -> Scan:
+    """Return another scan by the same detector with the scan's mask, bad pixels and rings."""
+    return replace(other, mask=scan.mask, corrections=scan.corrections)
 
 
 def sample_of_views(scan: Scan) -> NDArray[np.intp]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -156,6 +157,18 @@ class Scan:
             raise InputError(f"{self.name}: view {view}: found a pixel that is no finite number")
         return pixels
 
+    def checksum(self) -> str:
+        """Return a checksum by which an alignment can be matched to its scan.
+
+        SHA-256 over the shape and three radiographs (first, middle, last): a whole scan of many GB
+        would take longer to read than to align.
+        """
+        digest = hashlib.sha256(repr(self.shape).encode())
+        for view in sorted({0, self.views // 2, self.views - 1}):
+            pixels = np.ascontiguousarray(self.projections[view : view + 1], dtype="<f4")
+            digest.update(pixels.tobytes())
+        return f"sha256:{digest.hexdigest()}"
+
     def _warn_of_dark(self, transmission: NDArray[np.float32]) -> None:
         dark = transmission <= _DARKEST
         part = (dark if self.mask is None else dark & self.mask).mean(axis=(1, 2))
@@ -173,10 +186,6 @@ class Scan:
         if self.mask is None or self.mask.all():
             return self.corrections
         return (self.corrections or Corrections()).masked(self.mask)
-
-    def corrections_of_detector(self) -> Corrections | None:
-        """Return those corrections that hold for other views of the same detector, too."""
-        return None if self.corrections is None else replace(self.corrections, offset=None)
 
     @property
     def registration_mask(self) -> NDArray[np.bool_] | None:

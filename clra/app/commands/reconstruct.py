@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from clra.methods.reconstruction.imgr_state import Step
+    from clra.methods.reconstruction.imgr_state import ImgrStep
     from clra.model.grid import VolumeGrid
     from clra.model.motion import Motion
     from clra.model.scan import Scan
@@ -105,7 +105,7 @@ def reconstruct(
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
     """
     from clra.app.arguments import volume_file
-    from clra.app.output_checks import motion_for, room_for
+    from clra.app.output_checks import alignment_for, room_for
     from clra.app.scan_description import metric
     from clra.io.volumes.volume_files import open_volume
     from clra.methods.reconstruction.iterative import sorted_options
@@ -130,10 +130,11 @@ def reconstruct(
     sorted_options(method, options)
     known = valid_views = None
     if motion is not None:
-        opened, known, valid_views = motion_for(opened, motion, reading.geometry())
+        opened, alignment = alignment_for(opened, motion, reading.geometry())
+        known, valid_views = alignment.motion, alignment.valid_views
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
-    steps: tuple[Step, ...] = ()
+    steps: tuple[ImgrStep, ...] = ()
     with console.progress() as progress:
         if method == "imgr":
             steps = _imgr(
@@ -195,7 +196,7 @@ def _imgr(
     console: Console,
     progress: "ProgressCallback",
     limits: dict[str, Any],
-) -> "tuple[Step, ...]":
+) -> "tuple[ImgrStep, ...]":
     """Reconstruct by multigrid iteration, keep what Ctrl-C leaves, or go on from there."""
     import numpy as np
 
@@ -205,7 +206,7 @@ def _imgr(
     from clra.methods.reconstruction.imgr import imgr
     from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
     from clra.methods.reconstruction.iterative import sorted_options
-    from clra.ops.runtime.devices import choose_devices
+    from clra.ops.runtime.devices import usable_devices
     from clra.ops.streaming.stream import Stream
 
     osem, cycle = sorted_options("imgr", options)
@@ -218,7 +219,7 @@ def _imgr(
         **options,
     }
     saved = SavedState(out, scan, settings)
-    stream = Stream(choose_devices(console.device)[0], report=progress, **limits)
+    stream = Stream(usable_devices(console.device, progress)[0], report=progress, **limits)
     state = saved.load(stream, grid) if resume else None
     try:
         found = imgr(

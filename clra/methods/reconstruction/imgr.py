@@ -22,9 +22,9 @@ from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.methods.reconstruction.imgr_level import MultigridLevel
 from clra.methods.reconstruction.imgr_state import (
     ImgrState,
+    ImgrStep,
     MultigridResult,
     ReconstructionInterrupted,
-    Step,
 )
 from clra.methods.reconstruction.osem_tr import OrderedSubsets
 from clra.methods.reconstruction.residuals import between
@@ -193,7 +193,7 @@ class _Run:
         if level.lowest:
             # 9: OSEM-TR
             level.reconstruct(volume, motion, ~rejected, title)
-        step = Step(cycle, level_name(level.factor), misfit, time.perf_counter() - started)
+        step = ImgrStep(cycle, level_name(level.factor), misfit, time.perf_counter() - started)
         self.stream.report(f"{title}: misfit {misfit:.4g} before", 1, 1)
         return ImgrState(
             volume,
@@ -221,7 +221,7 @@ class _Run:
         return motion.normalised(), rejected
 
     def _history(
-        self, step: Step, motion: Motion, found: Registered, level: MultigridLevel
+        self, step: ImgrStep, motion: Motion, found: Registered, level: MultigridLevel
     ) -> tuple[Iteration, ...]:
         """Append what a registration did; warn if it says that it had better not."""
         far = "" if self.done.history else far_motion(found.motion, level.factor)

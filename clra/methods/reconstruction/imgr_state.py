@@ -11,7 +11,7 @@ from clra.ops.streaming.volume import Volume
 
 
 @dataclass(frozen=True)
-class Step:
+class ImgrStep:
     """One level of one cycle.
 
     Attributes
@@ -44,7 +44,7 @@ class ImgrState:
         Of the radiographs.
     rejected : ndarray of bool, (views,)
         Radiographs that are rejected; they are left out.
-    steps : tuple of Step
+    steps : tuple of ImgrStep
         Finished ones.
     history : tuple of Iteration
         Their alignment.
@@ -55,7 +55,7 @@ class ImgrState:
     volume: Volume | None
     motion: Motion
     rejected: NDArray[np.bool_]
-    steps: tuple[Step, ...] = ()
+    steps: tuple[ImgrStep, ...] = ()
     history: tuple[Iteration, ...] = ()
     ended: bool = False
 
@@ -87,7 +87,7 @@ class MultigridResult:
         Attenuation [1/mm].
     motion : Motion
         Of the radiographs, estimated or given.
-    steps : tuple of Step
+    steps : tuple of ImgrStep
         Of the run.
     alignment : AlignmentResult or None
         Where it aligned.
@@ -95,5 +95,5 @@ class MultigridResult:
 
     volume: Volume
     motion: Motion
-    steps: tuple[Step, ...]
+    steps: tuple[ImgrStep, ...]
     alignment: AlignmentResult | None

@@ -1,17 +1,14 @@
-"""The commands that align, correct, reconstruct and report."""
+"""Estimate the motion of each radiograph."""
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from clra.app.commands.reconstruct import reconstruct
-from clra.app.console import Console, Memory, Reading, command
+from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.errors import InputError
-
-ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
+from clra.findings import Finding
 
 
 def align(
@@ -97,12 +94,13 @@ def align(
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
       clra align scan.nxs -o motion.h5 --autofocus
     """
+    from clra.app.annotations import annotated
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError
     from clra.app.output_checks import focus_attributes, matched
     from clra.app.plausible import doubt_of_turning
-    from clra.app.records import Record
     from clra.app.report.summary import Errors, findings_of, summary_of
+    from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
@@ -129,14 +127,12 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = None if start is None else Record.load(start)
+    earlier = None if start is None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
     about = {
         "file": str(scan.absolute()),
         "geometry": reading.geometry(),
-        "estimate": estimate,
-        "unobservable": "taken out" if gauge == "anchored" and method != "reference" else "left in",
         "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
         f"--estimate {estimate} --gauge {gauge}"
         f"{'' if reference is None else f' --reference {reference}'}"
@@ -163,15 +159,15 @@ def align(
                 **limits,
             )
         except AlignmentInterrupted as stopped:
-            record = Record.of(stopped.result, opened, earlier, interrupted="yes", **about)
-            record.save(out)
-            last = record.history[-1]
+            result = annotated(stopped.result, opened, earlier, interrupted="yes", **about)
+            write_alignment(out, result)
+            last = result.history[-1]
             raise InterruptedCommandError(
-                f"{out} keeps what {len(record.history)} iterations gave, the last at "
+                f"{out} keeps what {len(result.history)} iterations gave, the last at "
                 f"{last.level}; --start {out} goes on from there"
             ) from None
-        record = Record.of(result, opened, earlier, **about)
-        record.save(out)
+        result = annotated(result, opened, earlier, **about)
+        write_alignment(out, replace(result, volume=None))
         turned = sharpening_by_turning_back(
             opened.cropped(),
             result.motion.about(*opened.window_offset),
@@ -180,10 +176,13 @@ def align(
             **limits,
         )
         more = {"sharpening_by_turning_back": f"{turned:.3f}"}
-        record = replace(record, about={**record.about, **more})
-        record.save(out)
-        doubts = [doubt_of_turning(turned)]
-        errors = Errors.of(record, opened)
+        doubt = doubt_of_turning(turned)
+        doubts = [Finding("rotation", doubt)] if doubt else []
+        result = replace(
+            result, about={**result.about, **more}, warnings=(*result.warnings, *doubts)
+        )
+        write_alignment(out, replace(result, volume=None))
+        errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
             write_volume(volume, result.volume, grid, progress=progress)
@@ -191,7 +190,7 @@ def align(
             from clra.app.report.html_report import write_report
 
             findings = findings_of(
-                record,
+                result,
                 opened,
                 volume=result.volume,
                 device=console.device,
@@ -199,133 +198,12 @@ def align(
                 **limits,
             )
             write_report(report, findings)
-            doubts += set(findings.notes) - set(record.notes)
-    for doubt in filter(None, doubts):
-        warnings.warn(doubt, stacklevel=1)
-    values, text = summary_of(record, errors)
+            known = {str(finding) for finding in result.warnings}
+            doubts += [Finding("report", note) for note in findings.notes if note not in known]
+    for finding in doubts:
+        finding.warn()
+    values, text = summary_of(result, errors)
     beside = {"volume": volume, "report": report}
     written = {"file": out, **{name: path for name, path in beside.items() if path}}
     names = " and ".join(str(path) for path in written.values())
     console.summary({**written, **values}, f"wrote {names}\n{text}")
-
-
-def correct(
-    console: Console,
-    reading: Reading,
-    memory: Memory,
-    scan: ScanPath,
-    motion: Annotated[
-        Path, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
-    ],
-    out: Annotated[
-        Path, typer.Option("--output", "-o", metavar="CORRECTED.nxs", help="Scan to write.")
-    ],
-) -> None:
-    """Write a scan of corrected radiographs.
-
-    For programs that cannot take a motion: each radiograph is resampled, once. clra itself
-    reconstructs sharper from the scan as it is, with --motion. Views that the alignment flagged,
-    blank or wrong ones, keep their places in the file, but are marked invalid (image_key 3): clra
-    and other readers of NXtomo leave them out.
-
-    Examples
-    --------
-      clra correct scan.nxs --motion motion.h5 -o corrected.nxs
-    """
-    from clra.app.output_checks import motion_for, room_for
-    from clra.app.scan_description import views_flagged
-    from clra.io.scan_files import write_scan
-    from clra.methods.correction import correct as correct_scan
-
-    limits = memory.limits()
-    opened = reading.scan(scan)
-    opened, known, valid_views = motion_for(opened, motion, reading.geometry())
-    views, rows, columns = opened.shape
-    room_for(out, 4 * views * rows * columns, keep=(scan, motion))
-    with console.progress() as progress:
-        corrected = correct_scan(opened, known, console.device, **limits)
-        write_scan(out, corrected, valid_views=valid_views, progress=progress)
-    invalid = (~valid_views).nonzero()[0].tolist()
-    marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
-    console.summary(
-        {"file": out, "shape": opened.shape, "invalid": invalid},
-        f"wrote {out}: {views} corrected radiographs of {rows} x {columns}"
-        + marked * bool(invalid),
-    )
-
-
-def report(
-    console: Console,
-    reading: Reading,
-    memory: Memory,
-    motion: Annotated[Path, typer.Argument(metavar="MOTION.h5", help="Motion from clra align.")],
-    out: Annotated[
-        Path, typer.Option("--output", "-o", metavar="REPORT.html", help="Page to write.")
-    ],
-    scan: Annotated[
-        Path | None,
-        typer.Option(metavar="SCAN", help="The scan: adds slices and re-projections."),
-    ] = None,
-) -> None:
-    """Write a report of an alignment.
-
-    One HTML page that needs nothing else: corrections, convergence, confidence, and with the scan
-    slices and re-projections before and after.
-
-    Examples
-    --------
-      clra report motion.h5 -o report.html
-      clra report motion.h5 -o report.html --scan scan.nxs
-    """
-    from clra.app.output_checks import matched
-    from clra.app.records import Record
-    from clra.app.report.html_report import write_report
-    from clra.app.report.summary import findings_of
-    from clra.io.atomic import ensure_writable
-
-    limits = memory.limits()
-    record = Record.load(motion)
-    ensure_writable(out, keep=(motion, scan))
-    opened = None if scan is None else reading.scan(scan)
-    if opened is not None:
-        opened = matched(opened, record, motion, reading.geometry())
-    with console.progress() as progress:
-        findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
-    write_report(out, findings)
-    told = {} if findings.quality is None else {"quality": findings.quality}
-    console.summary({"file": out, **told}, f"wrote {out}")
-
-
-def demo(
-    console: Console,
-    out: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="FOLDER", help="Where to keep the files."),
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of all random numbers.", min=0)] = 0,
-) -> None:
-    """Simulate, align and reconstruct a small scan.
-
-    A space-filling scan whose radiographs jitter and drift by up to 10 pixels and grow and shrink
-    by up to 0.2 %. Takes less than a minute on a laptop without a GPU. Without --output the
-    files go to a new folder for temporary files.
-
-    Examples
-    --------
-      clra demo
-      clra demo --output demo --device nvidia
-    """
-    from clra.app.demonstration import run_demo
-
-    with console.progress() as progress:
-        shown = run_demo(out, seed=seed, device=console.device, progress=progress)
-    console.result(shown.values(), shown.text())
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    command(app, "align")(align)
-    command(app, "reconstruct")(reconstruct)
-    command(app, "correct")(correct)
-    command(app, "report")(report)
-    command(app, "demo")(demo)

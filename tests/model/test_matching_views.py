@@ -8,7 +8,7 @@ import pytest
 from clra.model.gauge.gauge import sample_points
 from clra.model.grid import default_grid
 from clra.model.trajectory import circular, helix
-from clra.model.view_matching import match_views
+from clra.model.view_selection import match_views
 
 STAGE = {"source_to_axis": 4.3627, "source_to_detector": 436.27, "pixel_size": 3.6}
 
