@@ -1,7 +1,7 @@
 """Measure every table of tools/README.md on the present code, one after the other.
 
 ``python tools/measure_all.py -o FOLDER`` runs the command of each table and puts what it prints
-between that table's markers in tools/README.md, with machine, driver and version. Each output is kept in
+between its markers in tools/README.md, with machine, driver and version. Each output is kept in
 FOLDER/NAME.md as soon as it is there: started again, the tool goes on where it was stopped, unless
 ``--again`` is given. ``--only NAME`` measures some; ``--list`` prints the names and commands.
 ``CLRA_TEST_DATA`` names the folder of public data that a few of them read.

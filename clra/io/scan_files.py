@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from dataclasses import replace
 from typing import Any
@@ -186,24 +185,6 @@ def write_scan(
         valid_views=valid_views,
         progress=progress,
     )
-
-
-def scan_checksum(scan: Scan) -> str:
-    """Return a checksum by which a motion file can be matched to its scan.
-
-    SHA-256 over the shape and three radiographs (first, middle, last): a whole scan of many GB
-    would take longer to read than to align.
-
-    Parameters
-    ----------
-    scan : Scan
-        Any.
-    """
-    digest = hashlib.sha256(repr(scan.shape).encode())
-    for view in sorted({0, scan.views // 2, scan.views - 1}):
-        pixels = np.ascontiguousarray(scan.projections[view : view + 1], dtype="<f4")
-        digest.update(pixels.tobytes())
-    return f"sha256:{digest.hexdigest()}"
 
 
 class _LineIntegrals:

@@ -78,12 +78,8 @@ class ForwardProjector:
         volume_order: str = "zyx",
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
-        _lanes: int | None = None,
-        _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(
-            context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
-        )
+        self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
         self.scratch_bytes = self._layout.scratch_bytes
         kernels = ("forward_rays", "forward_columns", "forward_tilted")
         self._project = Blocks(self._layout, "forwardproject", kernels, geometry.rows, _LINE)
@@ -215,12 +211,8 @@ class BackProjector:
         volume_order: str = "zyx",
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
-        _lanes: int | None = None,
-        _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(
-            context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
-        )
+        self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
         self.scratch_bytes = self._layout.scratch_bytes
         nz = grid.shape[0]
         if matched:
