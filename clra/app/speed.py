@@ -134,7 +134,7 @@ def measure(
     nz, ny, nx = grid.shape
     shape = (small.views, *small.shape)
     # Something to register: the same smooth pattern in every radiograph.
-    sheet = tuple(max(n, _LEAST) for n in shape[1:])
+    sheet = (max(shape[1], _LEAST), max(shape[2], _LEAST))
     row, column = np.ogrid[: sheet[0], : sheet[1]]
     pattern = np.sin(row / 5.0) * np.cos(column / 7.0) + np.sin((row + column) / 11.0)
     sheets = np.tile(pattern.astype(np.float32), (shape[0], 1, 1))
@@ -152,7 +152,11 @@ def measure(
         ("filtering", lambda: ramp(queue, filtered, radiographs), pixels),
         ("back", lambda: back(queue, volume, filtered), updates),
         ("forward", lambda: forward(queue, filtered, volume), updates),
-        ("registering", lambda: register(queue, estimates, registered, registered), float(sheets.size)),
+        (
+            "registering",
+            lambda: register(queue, estimates, registered, registered),
+            float(sheets.size),
+        ),
     )
     work += _exact_work(stream, geometry, level)
     seconds = {}

@@ -167,7 +167,7 @@ def test_no_hdf5(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="clra import makes one"):
         read_scan(tmp_path / "frame.tif")
     (tmp_path / "scan.txrm").touch()
-    with pytest.raises(InputError, match="cannot be read as .txrm"):
+    with pytest.raises(InputError, match=r"cannot be read as \.txrm"):
         read_scan(tmp_path / "scan.txrm")
 
 
