@@ -212,6 +212,8 @@ def write_ctsimu(
             "pixel_pitch": {a: {"value": 1e3 * PIXEL, "unit": "um"} for a in "uv"},
         },
         "source": {"voltage": {"value": 130, "unit": "kV"}},
+        "samples": [],
+        "materials": [],
         "acquisition": {
             "start_angle": {"value": 0, "unit": "deg"}, "stop_angle": {"value": 360, "unit": "deg"},
             "direction": "CCW", "number_of_projections": VIEWS, "include_final_angle": False,
