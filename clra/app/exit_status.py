@@ -8,11 +8,14 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from typer.core import TyperGroup
 
 from clra.errors import InputError
+
+if TYPE_CHECKING:
+    from clra.methods.execution.checkpoint import Checkpoint
 
 OK = 0
 FAILED = 1
@@ -36,6 +39,25 @@ class InterruptedCommandError(Exception):
         super().__init__(f"interrupted: {kept}")
 
 
+@contextmanager
+def keeping(checkpoint: "Checkpoint") -> Iterator[None]:
+    """Say what of a block's finished work is on disk, whatever ends it early."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not checkpoint.kept:
+            raise
+        raise InterruptedCommandError(_goes_on(checkpoint)) from None
+    except Exception as error:
+        if checkpoint.kept:
+            error.add_note(_goes_on(checkpoint))
+        raise
+
+
+def _goes_on(checkpoint: "Checkpoint") -> str:
+    return f"{checkpoint.folder} keeps {checkpoint.kept}, --resume goes on from there"
+
+
 def verdict(error: BaseException) -> tuple[int, str]:
     """Exit status of an error and the line that tells a user what to do.
 
@@ -53,7 +75,8 @@ def verdict(error: BaseException) -> tuple[int, str]:
         Without a line break.
     """
     status, text = _verdict(error)
-    return status, " ".join(text.split())
+    notes = () if status == BAD_INPUT else getattr(error, "__notes__", ())
+    return status, " ".join("; ".join((text, *notes)).split())
 
 
 def _verdict(error: BaseException) -> tuple[int, str]:
