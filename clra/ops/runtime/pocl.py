@@ -59,7 +59,7 @@ def needs_pairing(device: cl.Device) -> bool:
     release = re.search(r"PoCL (\d+)\.", platform.version)
     return (
         "Portable Computing Language" in platform.name
-        and bool(device.type & cl.device_type.CPU)
+        and "x86_64-" in device.version
         and release is not None
         and int(release[1]) < 5
         and "DISTRO" in platform.version
