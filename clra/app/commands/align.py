@@ -98,10 +98,9 @@ def align(
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
       clra align scan.nxs -o motion.h5 --autofocus
     """
-    from clra.app.annotations import annotated
+    from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError, keeping
-    from clra.app.output_checks import focus_attributes, matched
     from clra.app.plausible import doubt_of_turning
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
@@ -110,7 +109,7 @@ def align(
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
     from clra.methods.alignment.autofocus import sharpening_by_turning_back
-    from clra.methods.alignment.result import AlignmentInterrupted
+    from clra.methods.alignment.result import AlignmentInterrupted, finished
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.model.grid import default_grid
     from clra.model.schedule import parse_levels, parse_schedule
@@ -169,7 +168,8 @@ def align(
             result = annotated(stopped.result, opened, earlier, interrupted="yes", **about)
             write_alignment(out, result)
             raise InterruptedCommandError(
-                f"{out} keeps what {checkpoint.kept} gave, --resume goes on from there"
+                f"{out} keeps what {finished(stopped.result.history)} gave; --resume goes on from "
+                f"there, or --start {out}"
             ) from None
         result = annotated(result, opened, earlier, **about)
         write_alignment(out, replace(result, volume=None))

@@ -97,10 +97,11 @@ def reconstruct(
       clra reconstruct scan.nxs -o volume.h5 --method imgr --align
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
     """
+    from clra.app.annotations import alignment_for
     from clra.app.arguments import volume_file
     from clra.app.exit_status import keeping
-    from clra.app.output_checks import alignment_for, room_for
     from clra.app.scan_description import metric
+    from clra.io.atomic import ensure_writable
     from clra.io.volumes.volume_files import open_volume
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.methods.reconstruction.iterative import options_for
@@ -128,7 +129,7 @@ def reconstruct(
     if motion is not None:
         opened, alignment = alignment_for(opened, motion, reading.geometry())
     nz, ny, nx = grid.shape
-    room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
+    ensure_writable(out, (scan, motion, initial), 4 * nz * ny * nx)
     checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
     with console.progress() as progress, keeping(checkpoint):
         with open_volume(out, grid) as target:

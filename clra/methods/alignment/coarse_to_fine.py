@@ -22,7 +22,7 @@ from clra.methods.alignment.limits import false_shifts, far_motion, lost_feature
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered
-from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     history_from,
@@ -114,7 +114,7 @@ class CoarseToFine:
         except Cancelled:
             if not self.history:
                 raise
-            message = f"the alignment was ended early, after {_finished(self.history)}"
+            message = f"the alignment was ended early, after {finished(self.history)}"
             Finding("cancelled", message).warn()
 
     def align_level(self, stage: Stage, index: int = 0, done: int = 0) -> None:
@@ -219,7 +219,7 @@ class CoarseToFine:
             "fresh": self.fresh,
         }
         self.checkpoint.save(
-            _finished(self.history), values, arrays | registered_arrays(self.registered)
+            finished(self.history), values, arrays | registered_arrays(self.registered)
         )
 
     def _go_on_from(self, saved: Saved) -> tuple[int, int]:
@@ -258,9 +258,3 @@ class CoarseToFine:
             self.schedule,
             self.stream.device.name,
         )
-
-
-def _finished(history: Sequence[Iteration]) -> str:
-    """Say what is finished."""
-    count = len(history)
-    return f"{count} iteration{'s' * (count > 1)}, the last at {history[-1].level}"

@@ -92,6 +92,12 @@ class SupportsAsDict(Protocol):
         ...
 
 
+def finished(history: Sequence[Iteration]) -> str:
+    """Say what is finished: "2 iterations, the last at HR"."""
+    count = len(history)
+    return f"{count} iteration{'s' * (count > 1)}, the last at {history[-1].level}"
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class AlignmentResult:
     """What alignment found, how good it is and where it comes from.
