@@ -1,6 +1,7 @@
 """What an error means to the caller of a command: an exit status and one line on stderr."""
 
 import errno
+import shlex
 import signal
 import sys
 import threading
@@ -8,6 +9,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 from typer.core import TyperGroup
@@ -24,6 +26,14 @@ INTERRUPTED = 130
 
 _DEBUG = "--debug"
 _BUG = "this is a bug in clra, please report it with all that is printed here"
+
+
+_COMMAND: ContextVar[str] = ContextVar("command", default="")
+
+
+def command_line() -> str:
+    """Return the command line that is being run, as a shell would take it."""
+    return _COMMAND.get()
 
 
 class InterruptedCommandError(Exception):
@@ -181,6 +191,7 @@ class Group(TyperGroup):
         given = list(sys.argv[1:] if args is None else args)
         # Wanted mostly after something failed, so it may be added at either end of the line.
         debug = _DEBUG in given
+        _COMMAND.set(shlex.join(["clra", *given]))
         try:
             with _plain_warnings(), _ended_like_ctrl_c():
                 status = super().main(

@@ -385,3 +385,15 @@ def test_files_that_are_there_are_kept_where_that_is_wanted(clra, scan_file, tmp
     refused(done, 2, "v.h5", "it is there already", "--no-overwrite")
     assert out.read_text() == "old" and os.listdir(tmp_path) == ["v.h5"]
     assert clra("reconstruct", scan_file, "-o", tmp_path / "w.h5", "--no-overwrite")[0] == 0
+
+
+@pytest.mark.filterwarnings("ignore:.*other radiographs")
+def test_outputs_tell_the_command_that_made_them(clra, scan_file, motion_file, record, tmp_path):
+    volume, corrected = tmp_path / "a volume.h5", tmp_path / "c.nxs"
+    for command, out in (("reconstruct", volume), ("correct", corrected)):
+        assert clra(command, scan_file, "-o", out, "--motion", motion_file)[0] == 0
+        with h5py.File(out) as file:
+            told = dict(file.attrs)
+        assert told["command"].startswith(f"clra {command} {scan_file} -o ")
+        assert told["scan_checksum"] == read_scan(scan_file).checksum()
+        assert told["alignment_checksum"] == record.checksum_of_motion()

@@ -105,6 +105,7 @@ def align(
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
+    from clra.io.provenance import provenance
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
@@ -192,7 +193,10 @@ def align(
         errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
-            write_volume(volume, result.volume, grid, progress=progress)
+            made = provenance(
+                command=result.command, scan=opened, alignment=result, method=method, grid=grid
+            )
+            write_volume(volume, result.volume, grid, provenance=made, progress=progress)
             checkpoint.clear()
         if report is not None:
             from clra.app.report.html_report import write_report

@@ -99,9 +99,10 @@ def reconstruct(
     """
     from clra.app.annotations import alignment_for
     from clra.app.arguments import volume_file
-    from clra.app.exit_status import keeping
+    from clra.app.exit_status import command_line, keeping
     from clra.app.scan_description import metric
     from clra.io.atomic import ensure_writable
+    from clra.io.provenance import provenance
     from clra.io.volumes.volume_files import open_volume
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.methods.reconstruction.iterative import options_for
@@ -130,9 +131,17 @@ def reconstruct(
         opened, alignment = alignment_for(opened, motion, reading.geometry())
     nz, ny, nx = grid.shape
     ensure_writable(out, (scan, motion, initial), 4 * nz * ny * nx)
+    made = provenance(
+        command=command_line(),
+        scan=opened,
+        alignment=alignment,
+        method=method,
+        options=options,
+        grid=grid,
+    )
     checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
     with console.progress() as progress, keeping(checkpoint):
-        with open_volume(out, grid) as target:
+        with open_volume(out, grid, provenance=made) as target:
             done = reconstruct_into(
                 target,
                 opened,
