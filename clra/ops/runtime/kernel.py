@@ -24,6 +24,9 @@ class Step:
         Work-group wanted; halved until the queue's device allows it.
     defines : mapping, optional
         Preprocessor definitions.
+    required : bool
+        Whether the kernel is compiled for groups of (``GROUP_X``, ``GROUP_Y``, 1) work-items; these
+        are halved, and it is compiled again, until all devices allow it.
     """
 
     def __init__(
@@ -33,10 +36,20 @@ class Step:
         function: str,
         local: Sequence[int],
         defines: Mapping[str, object] | None = None,
+        *,
+        required: bool = False,
     ) -> None:
         self._builds = builds(context)  # held, so that others find it
-        self._kernel = self._builds.kernel(file, function, defines)
         self._wanted = tuple(local)
+        fits = False
+        while not fits:
+            wanted = self._wanted
+            sizes = {"GROUP_X": wanted[0], "GROUP_Y": wanted[1]} if required else {}
+            self._kernel = self._builds.kernel(file, function, {**(defines or {}), **sizes})
+            if required:
+                for device in context.devices:
+                    self._wanted = work_group_size(self._kernel, device, self._wanted)
+            fits = self._wanted == wanted
         self._allowed: dict[cl.Device, tuple[int, ...]] = {}
 
     def __call__(
