@@ -182,13 +182,10 @@ class GpuBack:
             pieces = -(-count // _RUN)
             if high - low <= _SPREAD * np.ptp(heights, axis=1).mean():
                 pieces = 1
-            for k in range(pieces):
-                run = slice(
-                    part.start + count * k // pieces, part.start + count * (k + 1) // pieces
-                )
+            for run in equal_parts(part, pieces):
                 seen = layout.heights[run]
-                bottom, top = int(seen[:, 0].min()), int(seen[:, 1].max())
-                yield run, bottom, max(top, bottom + 1)
+                bottom = min(int(seen[:, 0].min()), layout.sizes[2] - 1)
+                yield run, bottom, max(int(seen[:, 1].max()), bottom + 1)
 
 
 class GpuAdjoint:
