@@ -24,6 +24,9 @@ class DeviceProfile:
         Elements along z, or rows, in a vector of the projectors' kernels.
     image_lanes : {2, 8}
         Columns in a vector of the kernels for images.
+    image_group : tuple of int
+        Work-group of the kernels for images. GPUs hold few groups at a time, which have to be large
+        to fill them.
     reduction_group : int
         Most work-items that share an image in a reduction; 1 on CPUs.
     fft : {"scipy", "reikna"}
@@ -46,6 +49,7 @@ class DeviceProfile:
     form: Literal["cpu", "gpu"]
     projector_lanes: int
     image_lanes: int
+    image_group: tuple[int, int, int]
     reduction_group: int
     fft: Literal["scipy", "reikna"]
     shared_memory: bool
@@ -72,6 +76,7 @@ CPU = DeviceProfile(
     form="cpu",
     projector_lanes=8,
     image_lanes=8,
+    image_group=(32, 1, 1),
     reduction_group=1,
     fft="scipy",
     shared_memory=True,
@@ -85,7 +90,8 @@ GPU = DeviceProfile(
     form="gpu",
     projector_lanes=1,
     image_lanes=2,
-    reduction_group=64,
+    image_group=(32, 4, 1),
+    reduction_group=256,
     fft="reikna",
     shared_memory=False,
     projector_bytes=256 << 20,
