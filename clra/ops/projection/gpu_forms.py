@@ -70,7 +70,7 @@ class GpuForward:
 
     def _built(self, kernel: str, defines: dict[str, object]) -> Step:
         context = self._layout.context
-        return Step(context, "forwardproject.cl", kernel, _GROUP, defines, required=True)
+        return Step(context, "forwardproject.cl", kernel, _GROUP, defines)
 
     @property
     def _step(self) -> Step:
@@ -126,7 +126,7 @@ class GpuBack:
     def _built(self, kernel: str) -> Step:
         defines = {**size_constants(self._layout), "VOXELS": _VOXELS}
         context = self._layout.context
-        return Step(context, "backproject.cl", kernel, _GROUP, defines, required=True)
+        return Step(context, "backproject.cl", kernel, _GROUP, defines)
 
     @property
     def _step(self) -> Step:
@@ -206,7 +206,7 @@ class GpuAdjoint:
 
     def _built(self, kernel: str, defines: dict[str, object]) -> Step:
         defines = {**size_constants(self._layout), **defines}
-        return Step(self._layout.context, "adjoint.cl", kernel, _GROUP, defines, required=True)
+        return Step(self._layout.context, "adjoint.cl", kernel, _GROUP, defines)
 
     @property
     def _step(self) -> Step:

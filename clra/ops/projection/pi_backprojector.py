@@ -91,7 +91,7 @@ class PiBackProjector:
         else:
             constants = {**size_constants(self._layout), "VOXELS": _GPU_VOXELS}
             file, kernel = "pi_backprojector.cl", "pi_backproject"
-            self._step = Step(context, file, kernel, (32, 8, 1), constants, required=True)
+            self._step = Step(context, file, kernel, (32, 8, 1), constants)
         columns = np.arange(own.shape[1] + 1)
         borders = np.sort(own.row(np.stack(own.window(own.tangent_u(columns)), axis=1)), axis=1)
         self._window = to_device(context, borders)

@@ -21,12 +21,10 @@ class Step:
     file, function : str
         Kernel file and kernel.
     local : sequence of int
-        Work-group wanted; halved until the queue's device allows it.
+        Work-group wanted; halved until all devices allow it. For GPUs the kernel is compiled for
+        it, as (``GROUP_X``, ``GROUP_Y``, 1).
     defines : mapping, optional
         Preprocessor definitions.
-    required : bool
-        Whether the kernel is compiled for groups of (``GROUP_X``, ``GROUP_Y``, 1) work-items; these
-        are halved, and it is compiled again, until all devices allow it.
     """
 
     def __init__(
@@ -36,21 +34,19 @@ class Step:
         function: str,
         local: Sequence[int],
         defines: Mapping[str, object] | None = None,
-        *,
-        required: bool = False,
     ) -> None:
         self._builds = builds(context)  # held, so that others find it
-        self._wanted = tuple(local)
-        fits = False
-        while not fits:
-            wanted = self._wanted
-            sizes = {"GROUP_X": wanted[0], "GROUP_Y": wanted[1]} if required else {}
-            self._kernel = self._builds.kernel(file, function, {**(defines or {}), **sizes})
+        self._local = tuple(local)
+        given: dict[str, object] = dict(defines or {})
+        required = not profile_of(context).on_cpu and "GROUP" not in given
+        asked: tuple[int, ...] = ()
+        while asked != self._local:
+            asked = self._local
             if required:
-                for device in context.devices:
-                    self._wanted = work_group_size(self._kernel, device, self._wanted)
-            fits = self._wanted == wanted
-        self._allowed: dict[cl.Device, tuple[int, ...]] = {}
+                given |= {"GROUP_X": asked[0], "GROUP_Y": (*asked, 1)[1]}
+            self._kernel = self._builds.kernel(file, function, given)
+            for device in context.devices:
+                self._local = work_group_size(self._kernel, device, self._local)
 
     def __call__(
         self,
@@ -71,11 +67,7 @@ class Step:
                 values.append(np.float32(argument))
             else:
                 values.append(np.int32(argument))
-        device = queue.device
-        local = self._allowed.get(device)
-        if local is None:
-            local = work_group_size(self._kernel, device, self._wanted)
-            self._allowed[device] = local
+        local = self._local
         return self._kernel(queue, global_size(size, local), local, *values, wait_for=wait_for)
 
 
