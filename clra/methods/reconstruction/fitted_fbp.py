@@ -72,7 +72,7 @@ def fitted_fbp(
     terms = terms if positive else 0
     volumes = VOLUMES if terms else 1
 
-    def reconstructed(measured: Radiographs, onto: Volume | None) -> Volume:
+    def reconstructed(measured: Radiographs, onto: Volume | None, doing: str) -> Volume:
         return ramp_fbp(
             stream,
             measured,
@@ -84,15 +84,20 @@ def fitted_fbp(
             window="ram-lak" if onto is None else _WINDOW,
             volumes=volumes,
             onto=onto,
-            stage=stage,
+            stage=f"{stage}: {doing}",
         )
 
-    volume = reconstructed(radiographs, None)
+    volume = reconstructed(radiographs, None, "reconstructing")
     for _ in range(terms):
         lacking = reprojections(
-            stream, volume, geometry, radiographs.level, stage, lacking_of=(radiographs, used)
+            stream,
+            volume,
+            geometry,
+            radiographs.level,
+            f"{stage}: simulating",
+            lacking_of=(radiographs, used),
         )
-        reconstructed(lacking, volume)
+        reconstructed(lacking, volume, "correcting")
     return volume
 
 
@@ -137,7 +142,7 @@ def reprojections(
         project(projected, views)
         if measured is not None and subtract is not None:
             there = stream.upload(measured.read(views))
-            still = np.tile(np.float32([0, 0, 1]), (len(projected), 1))
+            still = np.tile(np.array([0, 0, 1], np.float32), (len(projected), 1))
             subtract(stream.queue, projected, there, projected, stream.upload(still))
         kept.write(views.start, stream.download(projected))
     stream.report(stage, geometry.views, geometry.views)

@@ -8,8 +8,8 @@ import pytest
 
 import clra
 from clra.methods.alignment.level import Level
-from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.methods.alignment.options import Solver
+from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.phantoms.ellipsoids import Ellipsoids
@@ -63,7 +63,7 @@ def _size(motion):
 def test_what_is_found_where_nothing_moved_is_found_out(scan):
     left = _size(_found(scan, Solver()))
     biased = _size(_found(scan, Solver(unbias=False)))
-    assert (left < 0.5 * biased).all()
+    assert (left < 0.6 * biased).all()
 
 
 def test_slabs_and_chunks_change_nothing(scan):
