@@ -9,7 +9,7 @@ from clra.findings import collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
-from clra.methods.alignment.reprojection import with_margin
+from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
 from clra.methods.preparation import prepared, with_detector_of
@@ -169,6 +169,7 @@ def align(
             motion = drift.motion
         start = motion or Motion.identity(scan.views)
         start = start.caused_by("source" if estimate == "source" else "detector")
+        own_grid = grid is None
         grid = grid or default_grid(part.geometry)
         solver = solver or Solver()
         scale = scale and solver.estimator == "gauss-newton"
@@ -196,7 +197,7 @@ def align(
                 run = CoarseToFine(
                     stream,
                     part,
-                    with_margin(grid),
+                    region_of(stream, part, grid, own=own_grid),
                     schedule,
                     scale,
                     anchor,

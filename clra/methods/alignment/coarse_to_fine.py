@@ -20,6 +20,7 @@ from clra.methods.alignment.acceleration import MotionSteps
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
@@ -33,7 +34,6 @@ from clra.methods.execution.packing import (
     registered_from,
 )
 from clra.model.gauge.gauge import Gauge, sample_points
-from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import Stage, converged, level_name, update_size
@@ -52,8 +52,8 @@ class CoarseToFine:
         Device and memory budget.
     scan : Scan
         At full resolution.
-    grid : VolumeGrid
-        At full resolution, with the margin that views at the ends of a scan look through.
+    region : Region
+        Where to reconstruct, at full resolution.
     schedule : str
         As it was written, for the result.
     scale : bool
@@ -72,7 +72,7 @@ class CoarseToFine:
 
     stream: Stream
     scan: Scan
-    grid: VolumeGrid
+    region: Region
     schedule: str
     scale: bool
     anchor: bool
@@ -92,7 +92,7 @@ class CoarseToFine:
 
     def __post_init__(self) -> None:
         self.motion = self.start
-        points = sample_points(self.grid)
+        points = sample_points(self.region.sample)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
         # magnifications of several per cent.
@@ -121,7 +121,7 @@ class CoarseToFine:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
+        level = Level(self.stream, self.scan, self.region, self.solver, stage.level)
         if not self.history:
             self.rejected = unusable_radiographs(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of

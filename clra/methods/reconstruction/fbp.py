@@ -1,6 +1,7 @@
 """Ramp-filtered back-projection for any trajectory, streamed."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import PlaneWriter, Volume
 
+# Width of the detector, in detectors, by whose views voxels beside the field of view of a truncated
+# sample are divided: by those alone that show them they would come out too strong, and corrections
+# overshoot. A sample 1.2 times as wide as the field ended at 0.58 pixel in u instead of 0.24.
+_WIDE = 3
+
 
 def ramp_fbp(
     stream: Stream,
@@ -33,6 +39,7 @@ def ramp_fbp(
     circle: bool = True,
     positive: bool = False,
     window: str = "ram-lak",
+    extend: bool = False,
     planes: slice | None = None,
     target: PlaneWriter | None = None,
     onto: Volume | None = None,
@@ -67,15 +74,16 @@ def ramp_fbp(
         Leave zero what lies outside the circle that all views see.
     positive : bool
         Raise negative attenuations to zero.
-    window : str
-        As for :class:`clra.ops.filtering.ramp.RampFilter`.
+    window, extend
+        As for :class:`clra.ops.filtering.ramp.RampFilter`. With `extend` voxels beside the field of
+        view are divided by all views that would show them on a wider detector.
     planes : slice, optional
         Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
     onto : Volume, optional
-        On this grid, in the same slabs: changed by what is reconstructed, ``max(0, onto + update)``,
-        and returned. `positive`, `planes` and `target` do not go with it.
+        On this grid, in the same slabs: changed to ``max(0, onto + update)`` and returned.
+        `positive`, `planes` and `target` do not go with it.
 
     Returns
     -------
@@ -93,13 +101,22 @@ def ramp_fbp(
     chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
     weight = neighbour_weights(geometry.source, chosen) * angle_weights(geometry)
     ramp = RampFilter(
-        context, geometry, row_weight=row_weight, view_weight=weight, window=window, **memory
+        context,
+        geometry,
+        row_weight=row_weight,
+        view_weight=weight,
+        window=window,
+        extend=extend,
+        **memory,
     )
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])
+    counted = geometry.subset(chosen)
+    if extend:
+        counted = replace(counted, shape=(geometry.rows, _WIDE * geometry.columns))
     coverage = Coverage(
         context,
-        geometry.subset(chosen),
+        counted,
         grid.slab(near.start, near.stop),
         row_weight,
         view_weight=weight[chosen],
