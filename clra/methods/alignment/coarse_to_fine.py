@@ -23,6 +23,7 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered
+from clra.methods.alignment.slow_modes import SlowSteps, held
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
@@ -128,7 +129,7 @@ class CoarseToFine:
         # that one, its first steps would go astray.
         steps = self.solver.acceleration()
         self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
-        previous = None
+        slow, previous = SlowSteps(), None
         for iteration in range(done + 1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
@@ -140,7 +141,8 @@ class CoarseToFine:
                 self.rejected, level.bias = self.rejected | wrong, None
                 found = self._iterate(level, title=of)
             step, note = self._move(found, stage.level)
-            update = np.abs(step)
+            update = np.abs(step[:2])
+            left = slow.left(step[:, ~self.rejected])
             self.history.append(
                 Iteration.of(
                     name,
@@ -155,8 +157,10 @@ class CoarseToFine:
             )
             # 6, 13: until converged, whatever becomes of views that are rejected
             update_u, update_v = update[:, ~self.rejected]
-            ended = stage.iterations is None and converged(
-                update_u, update_v, previous, stage.tolerance
+            ended = (
+                stage.iterations is None
+                and left < stage.slow
+                and converged(update_u, update_v, previous, stage.tolerance)
             )
             self._keep(index, stage.limit if ended else iteration)
             if ended:
@@ -185,14 +189,15 @@ class CoarseToFine:
     def _move(self, found: Registered, level: int) -> tuple[Floats, str]:
         """Algorithm 1, step 5: append what was found.
 
-        Returns the plain step in u and v, and what was warned of.
+        Returns the plain step as lengths, and what was warned of.
         """
         self.registered = found
         self.rejected = outliers(found.correlation)
-        self.found = from_neighbours(self.motion.then(found.motion), self.rejected).normalised()
+        there = self._held(self.motion.then(found.motion), found, level)
+        self.found = from_neighbours(there, self.rejected).normalised()
         there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
         step = self.steps.step(self.motion, there)
-        valid_views = np.abs(step[:, ~self.rejected])
+        valid_views = np.abs(step[:2, ~self.rejected])
         if self.history:
             note = warned(false_shifts(*self.last, level, valid_views))
             self.fresh = bool(note)
@@ -204,6 +209,16 @@ class CoarseToFine:
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
         return step, note
+
+    def _held(self, motion: Motion, found: Registered, level: int) -> Motion:
+        """Pull magnifications to those expected, where registration did not."""
+        spread = self.solver.jitter(self.scan.geometry.binned(level).shape)
+        if not (self.scale and spread):
+            return motion
+        expected = np.log(self.start.magnification)
+        logarithm = np.log(motion.magnification) - expected
+        pulled = held(logarithm, found.sigma[:, 2], spread)
+        return replace(motion, magnification=np.exp(pulled + expected))
 
     def _keep(self, stage: int, done: int) -> None:
         """Keep what the iterations so far gave: `done` of a stage."""

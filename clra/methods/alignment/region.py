@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clra.methods.alignment.reprojection import with_margin
-from clra.methods.truncation import AT_BORDER, truncated
+from clra.methods.truncation import AT_BORDER, falls_outwards, truncated
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, axis_ranges
 from clra.model.scan import Scan
@@ -63,7 +63,7 @@ def region_of(stream: Stream, scan: Scan, grid: VolumeGrid, *, own: bool = True)
         ends of a scan show something past it; a margin along z it gets in any case.
     """
     radiographs = Radiographs(stream, scan, 1)
-    cut = bool(truncated(radiographs))
+    cut = bool(truncated(radiographs)) and falls_outwards(radiographs)
     sample = with_margin(grid)
     wide = sample
     if own and cut:
