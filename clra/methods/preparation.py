@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.findings import Finding
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.corrections.corrections import Corrections
 from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
-from clra.model.corrections.options import CorrectionOptions
 from clra.model.scan import Scan
 from clra.progress import ProgressCallback, tell
 

@@ -23,7 +23,7 @@ from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevic
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
 from clra.model.angular_coverage import part_of_a_turn
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.helix.pi_intervals import heights_between
@@ -211,11 +211,11 @@ def reconstruct_into(
     if keeping is not None and keeping.resume and options is None and not align:
         raise InputError(f"resume: found it with {method} alone, which keeps nothing on its way")
     with collected() as findings:
+        devices = usable_devices(device, progress)
         scan = prepared(scan, corrections, progress=progress)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
         grid = grid or default_grid(scan.geometry)
-        devices = usable_devices(device, progress)
         limits: dict[str, Any] = {
             "max_device_memory": max_device_memory,
             "max_host_memory": max_host_memory,
