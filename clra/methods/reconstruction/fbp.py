@@ -15,6 +15,7 @@ from clra.model.view_selection import runs, views_that_see
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage, around
 from clra.ops.projection.projector import BackProjector
+from clra.ops.streaming.multigrid import add_to_slab
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import PlaneWriter, Volume
@@ -30,8 +31,11 @@ def ramp_fbp(
     stage: str = "back-projecting",
     volumes: int = 1,
     circle: bool = True,
+    positive: bool = False,
+    window: str = "ram-lak",
     planes: slice | None = None,
     target: PlaneWriter | None = None,
+    onto: Volume | None = None,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
 
@@ -61,10 +65,17 @@ def ramp_fbp(
         How many volumes like this one the device has to hold at a time.
     circle : bool
         Leave zero what lies outside the circle that all views see.
+    positive : bool
+        Raise negative attenuations to zero.
+    window : str
+        As for :class:`clra.ops.filtering.ramp.RampFilter`.
     planes : slice, optional
         Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
+    onto : Volume, optional
+        On this grid, in the same slabs: changed by what is reconstructed, ``max(0, onto + update)``,
+        and returned. `positive`, `planes` and `target` do not go with it.
 
     Returns
     -------
@@ -81,7 +92,9 @@ def ramp_fbp(
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
     chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
     weight = neighbour_weights(geometry.source, chosen) * angle_weights(geometry)
-    ramp = RampFilter(context, geometry, row_weight=row_weight, view_weight=weight, **memory)
+    ramp = RampFilter(
+        context, geometry, row_weight=row_weight, view_weight=weight, window=window, **memory
+    )
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])
     coverage = Coverage(
@@ -94,7 +107,7 @@ def ramp_fbp(
         allocator=stream.memory,
     )
     coverage.compute(queue)
-    volume = Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
+    volume = onto or Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
     slabs = volume.slabs
     seeing = [chosen & views_that_see(geometry, slab) for slab in slabs]
     total, done = sum(int(views.sum()) for views in seeing), 0
@@ -122,8 +135,13 @@ def ramp_fbp(
                 del measured, filtered
                 done += views.stop - views.start
         first = wanted.start - near.start + volume.planes[index].start
-        coverage.normalise(queue, attenuation, math.pi, first=first, volume_order="yxz")
-        if target is None:
+        lowest = 0.0 if positive else -math.inf
+        coverage.normalise(
+            queue, attenuation, math.pi, first=first, lowest=lowest, volume_order="yxz"
+        )
+        if onto is not None:
+            add_to_slab(stream, onto, index, attenuation)
+        elif target is None:
             volume.put(index, attenuation)
         else:
             volume.write_slab(index, attenuation, target)
