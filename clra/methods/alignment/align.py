@@ -10,8 +10,10 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.model.corrections.options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -41,6 +43,7 @@ def align(
     solver: Solver | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -83,6 +86,8 @@ def align(
         Parts of the iteration, to switch some off.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
 
     Returns
     -------
@@ -139,9 +144,11 @@ def align(
 
     scale = estimate != "shift"
     with collected() as findings:
+        scan = prepared(scan, corrections, progress=progress)
+        part = scan.cropped()
         if reference is not None:
             if reference.geometry.shape == scan.geometry.shape:
-                reference = replace(reference, mask=scan.mask).cropped()
+                reference = with_detector_of(scan, reference).cropped()
             drift = align_to_reference(stream, part, reference, scale=scale, truth=truth)
             if method == "reference":
                 return told(drift)

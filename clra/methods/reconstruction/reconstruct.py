@@ -11,12 +11,14 @@ from clra.methods.alignment.align import align as align_scan
 from clra.methods.alignment.result import AlignmentResult
 from clra.methods.correction import corrected
 from clra.methods.execution.several_devices import on_devices
+from clra.methods.preparation import prepared
 from clra.methods.reconstruction import iterative
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevich
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
 from clra.model.angular_coverage import part_of_a_turn
+from clra.model.corrections.options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.helix.pi_intervals import heights_between
@@ -45,6 +47,7 @@ def reconstruct(
     progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
     **options: Any,
 ) -> NDArray[np.float32]:
     """Reconstruct a volume.
@@ -81,6 +84,8 @@ def reconstruct(
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used, see `Stream`. The volume that is returned
         comes on top: :func:`reconstruct_into` takes one larger than the memory.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
     **options
         Of "osem-tr" and "imgr": the fields of `OrderedSubsets`
         (subsets, passes, update, initial, i0, background); of "imgr" also levels and cycles, as
@@ -112,6 +117,7 @@ def reconstruct(
         progress=progress,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
+        corrections=corrections,
         **options,
     )
     return planes.volume
@@ -131,6 +137,7 @@ def reconstruct_into(
     progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
     **options: Any,
 ) -> None:
     """Reconstruct a volume, and hand it on some planes at a time.
@@ -141,7 +148,7 @@ def reconstruct_into(
         Takes the planes, each once; `open_volume` gives one that writes a
         file.
     scan, method, grid, motion, align, device, alignment, valid_views, progress, \
-    max_device_memory, max_host_memory, options
+    max_device_memory, max_host_memory, corrections, options
         As :func:`reconstruct` takes them.
 
     Raises
@@ -159,6 +166,7 @@ def reconstruct_into(
     if valid_views is not None:
         valid_views = believed_views(valid_views, scan.views)
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
+    scan = prepared(scan, corrections, progress=progress)
     motion = None if motion is None else motion.about(*scan.window_offset)
     scan = scan.cropped()
     grid = grid or default_grid(scan.geometry)
