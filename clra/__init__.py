@@ -79,9 +79,12 @@ def __getattr__(name: str) -> Any:
     if name == "kernels":
         return import_module("clra.kernels")
     if name == "__version__":
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        return version("clra")
+        try:
+            return version("clra")
+        except PackageNotFoundError:
+            return "unknown"  # run from a checkout that is not installed
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'clra' has no attribute {name!r}")

@@ -80,6 +80,11 @@ def collected() -> Iterator[list[Finding]]:
         _COLLECTING.reset(token)
 
 
+def collected_so_far() -> tuple[Finding, ...]:
+    """Return the findings that the outermost :func:`collected` has by now."""
+    return tuple(next(iter(_COLLECTING.get()), ()))
+
+
 _LOG = logging.getLogger(__name__)
 _COLLECTING: ContextVar[tuple[list[Finding], ...]] = ContextVar("collecting", default=())
 _PACKAGE = str(Path(__file__).parent)

@@ -62,6 +62,15 @@ class Console:
 
 
 @dataclass(frozen=True)
+class Writing:
+    """How a command may write."""
+
+    no_overwrite: Annotated[
+        bool, typer.Option("--no-overwrite", help="Refuse to replace files that are there.")
+    ] = False
+
+
+@dataclass(frozen=True)
 class Memory:
     """How much memory a command may use."""
 
@@ -233,7 +242,9 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def command(
+    app: typer.Typer, name: str, *, writes: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a function as a command; groups of options among its parameters are spread out.
 
     Parameters
@@ -242,6 +253,9 @@ def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Call
         Where to.
     name : str
         What the command is called.
+    writes : bool
+        Whether it writes files: it has the options of :class:`Writing`, and its outputs are its own
+        until it ends.
 
     Returns
     -------
@@ -261,11 +275,20 @@ def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Call
                 shared += _options(group)
             else:
                 own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if writes:
+            shared += _options(Writing)
 
         def run(**values: Any) -> None:
             for key, group in groups.items():
                 values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
-            function(**values)
+            if not writes:
+                function(**values)
+                return
+            from clra.io.claims import one_run
+
+            writing = Writing(**{f.name: values.pop(f.name) for f in fields(Writing)})
+            with one_run(overwrite=not writing.no_overwrite):
+                function(**values)
 
         # typer learns a command's options from its signature and its annotations.
         run.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]

@@ -14,6 +14,7 @@ from clra.io.atomic import ensure_writable
 from clra.io.nxtomo.fields import Overrides
 from clra.io.nxtomo.reader import read_nxtomo
 from clra.io.nxtomo.writer import write_nxtomo
+from clra.io.provenance import Provenance
 from clra.io.scanners.recognise import read_scanner, recognise
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import ScannerScan
@@ -150,6 +151,7 @@ def write_scan(
     scan: Scan,
     *,
     valid_views: NDArray[np.bool_] | None = None,
+    provenance: Provenance | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write a scan's line integrals as NXtomo; the file appears whole or not at all.
@@ -163,6 +165,8 @@ def write_scan(
     valid_views : ndarray of bool, (views,), optional
         Views to be used, at least one, all by default. The others are written as well, marked
         invalid: readers of NXtomo, :func:`read_scan` too, leave them out.
+    provenance : mapping of str to str, optional
+        Where it comes from, see :func:`clra.io.provenance.provenance`: attributes of the root.
     progress : callable, optional
         Called with a ``Progress`` as frames are written.
 
@@ -183,6 +187,7 @@ def write_scan(
         truth=scan.truth,
         mask=scan.mask,
         valid_views=valid_views,
+        provenance=provenance,
         progress=progress,
     )
 
