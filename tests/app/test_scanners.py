@@ -142,10 +142,10 @@ def test_alignment_starts_from_the_vendors_motion(tmp_path: Path, clra) -> None:
         np.linalg.norm(reconstruct(scan, motion=motion) - still)
         for motion in (start, start.inverse(), None)
     ]
-    assert errors[0] < 0.6 * min(errors[1:])
+    assert errors[0] < 0.7 * min(errors[1:])
     out = tmp_path / "motion.h5"
     code, _, err = clra(
-        "align", path, "-o", out, "--start", path, "--schedule", "1HR", "--estimate", "shift", "-q"
+        "align", path, "-o", out, "--start", path, "--schedule", "1FR", "--estimate", "shift", "-q"
     )
     assert code == 0, err
     found = read_alignment(out).motion

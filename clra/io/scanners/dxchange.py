@@ -47,7 +47,7 @@ def is_dxchange(path: Path) -> bool:
             return False
         with h5py.File(path, "r") as file:
             return "exchange/data" in file
-    except (OSError, RuntimeError):
+    except (OSError, RuntimeError, KeyError):
         return False
 
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.key_value_text import MOST
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     ScannerScan,
@@ -129,11 +130,11 @@ class TxrmFile:
             If there is none, without a default.
         """
         values = self.numbers(*names, letter="i")
-        if values is not None and len(values) and values[0] > 0:
+        if values is not None and len(values) and 0 < values[0] <= MOST:
             return int(values[0])
         if default is None:
             found = "nothing" if values is None or not len(values) else f"{values[0]:g}"
-            raise InputError.at(self.path, names[0], found, "a whole number above 0")
+            raise InputError.at(self.path, names[0], found, f"a whole number of 1 to {MOST}")
         return default
 
     def _image(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -183,3 +183,49 @@ def test_numbers_as_scanners_write_them(value: str, number: float, tmp_path: Pat
     path.write_bytes(b"[A]\nkey=\xb5m\n")
     with pytest.raises(InputError, match=r"\[A\] key: found 'µm', expected a number"):
         KeyValueText.read(path).number("key", section="A")
+
+
+WRITERS = {
+    **{name: write for name, (write, _) in TEXTS.items()},
+    "dxchange": vendor.write_dxchange,
+    "zeiss": vendor.write_zeiss,
+    "ctsimu": vendor.write_ctsimu,
+}
+PIECES = (b"-", b"1e9", b"0", b"\n", b"=", b"nan", b"[", b'"', b",", b"null", b"e")
+
+
+def damaged(whole: bytes, random: np.random.Generator) -> bytes:
+    """A few bytes changed, lost or put in; or the end lost."""
+    for _ in range(random.integers(1, 4)):
+        place, kind = int(random.integers(len(whole))), random.integers(4)
+        if kind == 0:
+            whole = whole[:place] + bytes([random.integers(256)]) + whole[place + 1 :]
+        elif kind == 1:
+            whole = whole[:place] + whole[place + int(random.integers(1, 30)) :]
+        elif kind == 2:
+            whole = whole[:place] + PIECES[random.integers(len(PIECES))] + whole[place:]
+        else:
+            whole = whole[:place]
+        whole = whole or b"x"
+    return whole
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damage_of_any_kind_is_the_files_fault(name: str, tmp_path: Path) -> None:
+    if name == "zeiss":
+        pytest.importorskip("olefile")
+    path = WRITERS[name](tmp_path, None)
+    kept = {file: file.read_bytes() for file in sorted(tmp_path.rglob("*")) if file.is_file()}
+    random = np.random.default_rng(0)
+    given = {"parallel": True} if name == "dxchange" else {}
+    given |= TABLES if name == "heliscan" else {}
+    for _ in range(60):
+        file = list(kept)[random.integers(len(kept))]
+        file.write_bytes(damaged(kept[file], random))
+        try:
+            scan = read_scanner(path, ScannerOptions(**given))
+            if scan is not None and not scan.missing:
+                np.asarray(scan.frames[0:2])
+        except InputError as error:
+            assert "\n" not in str(error)
+        file.write_bytes(kept[file])
