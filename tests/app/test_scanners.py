@@ -42,7 +42,10 @@ WRITERS = {
     "tescan": (vendor.write_tescan, {}),
     "zeiss": (vendor.write_zeiss, {}),
     "dxchange": (vendor.write_dxchange, CONE),
-    "heliscan": (vendor.write_heliscan, {"angles": DEGREES, "shape": SHAPE}),
+    "heliscan": (
+        vendor.write_heliscan,
+        {"angles": DEGREES, "shape": SHAPE, "z_translation": 0 * DEGREES},
+    ),
     "ctsimu": (vendor.write_ctsimu, {}),
     "geom": (lambda folder, frames: vendor.write_geom(folder, frames, circle()), {"shape": SHAPE}),
 }

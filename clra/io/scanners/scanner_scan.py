@@ -99,6 +99,9 @@ class ScannerScan:
     def scan(self, white: float | None = None) -> Scan:
         """Return the scan; counts become transmission as those of an NXtomo file do.
 
+        What was found that may spoil a result is warned of; all of it is among the notes of the
+        projections.
+
         Parameters
         ----------
         white : float, optional
@@ -109,6 +112,8 @@ class ScannerScan:
         InputError
             If counts have neither flats nor `white`.
         """
+        for finding in self.findings:
+            finding.warn()
         projections = self.frames if self.missing else self._transmission(white)
         return Scan(
             projections,
@@ -158,7 +163,7 @@ class ScannerScan:
         darks = 0 if self.darks is None else self.darks.shape[0]
         count = before + views + sum(part.shape[0] for part in after)
         roles = np.arange(count)
-        return CountedRadiographs(
+        found = CountedRadiographs(
             FrameSequence([*first, self.radiographs(), *after]),
             path=os.fspath(self.path),
             views=roles[before : before + views],
@@ -167,6 +172,8 @@ class ScannerScan:
             white=white,
             normalised=self.kind != "counts",
         )
+        found.notes = (*map(str, self.findings), *found.notes)
+        return found
 
 
 def assembled(scan: ScannerScan, options: ScannerOptions, *, rotation: str) -> ScannerScan:

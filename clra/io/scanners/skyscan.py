@@ -135,6 +135,13 @@ def _findings(
         found.append(
             assumed(f"square pixels: CameraXYRatio {ratio:g} is not applied", "--pixel-size")
         )
+    for key, usual, advice in (
+        ("Camera Offset", "OFF", "both halves are taken as one radiograph"),
+        ("Scanning Trajectory", "ROUND", "a helix needs --z-translation FILE"),
+    ):
+        told = (text.find(key) or usual).upper()
+        if told != usual:
+            found.append(Finding("unread", f"{key} {told} is not read", advice))
     moved = text.number("Postalignment", default=0.0)
     if moved:
         found.append(

@@ -9,7 +9,7 @@ import pytest
 import tifffile
 import vendor_files as vendor
 
-from clra.errors import InputError
+from clra.errors import ClraWarning, InputError
 from clra.io.key_value_text import KeyValueText
 from clra.io.scan_files import import_scanner, read_scan
 from clra.io.scanners.recognise import read_scanner
@@ -25,7 +25,7 @@ TEXTS = {
     "heliscan": (vendor.write_heliscan, ("camera_length", "pixel_size_x")),
 }  # fmt: skip
 CASES = [(name, key) for name, (_, keys) in TEXTS.items() for key in keys if key[:3] != "SCO"]
-TABLES = {"angles": np.arange(24.0), "shape": vendor.SHAPE}
+TABLES = {"angles": np.arange(24.0), "shape": vendor.SHAPE, "z_translation": np.zeros(24)}
 
 
 def options(name: str) -> ScannerOptions:
@@ -124,8 +124,23 @@ def test_data_exchange_needs_distances_and_frames(tmp_path: Path) -> None:
 
 def test_heliscan_has_no_angles_of_its_own(tmp_path: Path) -> None:
     path = vendor.write_heliscan(tmp_path, np.full((vendor.VIEWS, *vendor.SHAPE), 0.5))
-    with pytest.raises(InputError, match="angles: found none, expected --angles FILE"):
-        read_scan(path)
+    still = {"z_translation": np.zeros(vendor.VIEWS)}
+    scan = read_scanner(path, ScannerOptions(shape=vendor.SHAPE, **still))
+    assert scan.geometry.views == vendor.VIEWS  # described it can be
+    with (
+        pytest.warns(ClraWarning, match="angles are not in this format: a turn is drawn"),
+        pytest.raises(InputError, match="angles: found none in this format, expected --angles"),
+    ):
+        scan.scan().read(0, 1)
+    with pytest.raises(InputError, match="angles: found none in this format, expected --angles"):
+        import_scanner(tmp_path / "scan.nxs", scan)
+    whole = path.read_text()
+    path.write_text(f"{whole}detector_size_x 30\ndetector_size_y 22\nviews 660\nsections_y 1\n")
+    with pytest.raises(InputError, match="found 660 pixels a frame, expected --shape"):
+        read_scan(path)  # 22 x 30 or 1 x 660
+    path.write_text(f"{whole}detector_size_x 30\ndetector_size_y 22\n")
+    assert read_scanner(path).geometry.shape == vendor.SHAPE
+    path.write_text(whole)
     with pytest.raises(
         InputError, match="rows and columns: found 660 pixels a frame, expected --sh"
     ):
