@@ -99,10 +99,15 @@ def read_nikon(path: Path, options: ScannerOptions) -> ScannerScan:
     frames = frames_or_missing([f for _, f in files], (len(degrees), *shape), path, expected)
     findings += [
         unverified("clockwise from above, columns to the left", "--rotation ccw or --flip columns"),
-        unverified(f"axis {offset:g} mm along the columns (ObjectOffsetX)", "--centre-offset"),
+        unverified(
+            f"axis {offset:g} mm along the columns (ObjectOffsetX)",
+            f"--centre-offset {offset / width * far / near:.4g}",
+        ),
     ]
     if roll or text.number("ObjectTilt", default=0.0):
-        findings.append(unverified("ObjectRoll and ObjectTilt", "--flip"))
+        findings.append(
+            unverified("ObjectRoll and ObjectTilt", "clra align --autofocus", "measures the roll")
+        )
     scan = ScannerScan(
         format="Nikon XTek",
         path=path,

@@ -200,6 +200,13 @@ def assembled(scan: ScannerScan, options: ScannerOptions, *, rotation: str) -> S
         raise InputError.at(
             scan.path, "radiographs", found, "{} of {} x {} pixels".format(*expected)
         )
+    near, far = (
+        float(np.median(getattr(geometry, name)))
+        for name in ("source_to_axis", "source_to_detector")
+    )
+    if far < near * (1 - 1e-9) or near <= 0:
+        found = f"{near:g} mm to the axis, {far:g} mm to the detector"
+        raise InputError.at(scan.path, "distances", found, "an axis before the detector")
     if options.rotation is not None and options.rotation != rotation:
         geometry = opposite_rotation(geometry)
     if options.flip is not None:
@@ -253,19 +260,18 @@ def _without_return(scan: ScannerScan) -> ScannerScan:
     )
 
 
-def unverified(what: str, option: str) -> Finding:
+def unverified(what: str, option: str, effect: str = "turns it") -> Finding:
     """Return the finding that a sign is not verified on a real scan, and what turns it.
 
     Parameters
     ----------
     what : str
         Which sign, and how it was taken.
-    option : str
-        The option that turns it.
+    option, effect : str
+        The option, and what it does about it.
     """
-    return Finding(
-        "unverified-sign", f"sign not verified on a real scan: {what}", f"{option} turns it", "info"
-    )
+    message = f"sign not verified on a real scan: {what}"
+    return Finding("unverified-sign", message, f"{option} {effect}", "info")
 
 
 def assumed(what: str, advice: str = "") -> Finding:

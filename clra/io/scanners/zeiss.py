@@ -23,6 +23,7 @@ from __future__ import annotations
 import struct
 import weakref
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,7 @@ class TxrmFile:
         except OSError as error:
             raise InputError(f"{path}: cannot be read as .txrm: {error}") from error
         weakref.finalize(self, self._ole.close)
+        self._lock = Lock()  # devices read their views in threads of their own
         self.shape = (
             self.whole("ImageInfo/NoOfImages", "ImageInfo/ImagesTaken"),
             self.whole("ImageInfo/ImageHeight"),
@@ -139,7 +141,8 @@ class TxrmFile:
 
     def _image(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
         rows, columns = self.shape[1:]
-        data = self._ole.openstream(name).read() if self._ole.exists(name) else b""
+        with self._lock:
+            data = self._ole.openstream(name).read() if self._ole.exists(name) else b""
         if len(data) != rows * columns * dtype.itemsize:
             expected = f"{rows * columns * dtype.itemsize}: {rows} x {columns} pixels of {dtype}"
             raise InputError.at(self.path, name, f"{len(data)} bytes", expected)

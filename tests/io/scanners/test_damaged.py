@@ -1,6 +1,7 @@
 """Keys that are missing or broken: one line with file, field, what was found and expected."""
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -70,6 +71,13 @@ def test_distances_of_nothing(name: str, tmp_path: Path) -> None:
         read_scanner(path, options(name))
 
 
+def test_a_detector_before_the_axis(tmp_path: Path) -> None:
+    path = vendor.write_nikon(tmp_path, None)
+    edited(path, "SrcToDetector", "20.0")
+    with pytest.raises(InputError, match="distances: found 30 mm to the axis, 20 mm to the detec"):
+        read_scanner(path)
+
+
 def test_no_radiographs_beside_the_metadata(tmp_path: Path) -> None:
     path = vendor.write_nikon(tmp_path, None)
     scan = read_scan(path)
@@ -79,6 +87,15 @@ def test_no_radiographs_beside_the_metadata(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=expected):
         import_scanner(tmp_path / "scan.nxs", read_scanner(path))
     assert not (tmp_path / "scan.nxs").exists()
+
+
+def test_threads_read_frames_of_many_files(tmp_path: Path) -> None:
+    levels = np.linspace(0.1, 0.9, vendor.VIEWS)[:, None, None]
+    path = vendor.write_skyscan(tmp_path, np.broadcast_to(levels, (vendor.VIEWS, *vendor.SHAPE)))
+    projections = read_scan(path).projections
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: projections[k : k + 1][0, 3, 5], list(range(24)) * 8))
+    np.testing.assert_allclose(found, np.tile(levels.ravel(), 8), atol=2e-5)
 
 
 def test_frames_that_do_not_fit(tmp_path: Path) -> None:
@@ -106,10 +123,11 @@ def test_tables_that_are_too_short(tmp_path: Path) -> None:
 
 def test_data_exchange_needs_distances_and_frames(tmp_path: Path) -> None:
     path = vendor.write_dxchange(tmp_path, None)
-    with pytest.raises(InputError, match=r"pixel size: found none, expected --pixel-size MM"):
-        read_scan(path)
     with pytest.raises(InputError, match=r"distances: found none.*--parallel, or in clra import"):
-        read_scan(path, options=ScannerOptions(pixel_size=0.1))
+        read_scan(path)
+    near = ScannerOptions(source_distance=30, detector_distance=90)
+    with pytest.raises(InputError, match=r"pixel size: found none, expected --pixel-size MM"):
+        read_scan(path, options=near)
     with h5py.File(path, "r+") as file:
         del file["exchange/theta"]
         file["exchange/theta"] = np.arange(5.0)
