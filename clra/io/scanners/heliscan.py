@@ -25,6 +25,7 @@ import numpy as np
 from clra.errors import InputError
 from clra.findings import Finding
 from clra.io.frames.frame_views import MissingFrames
+from clra.io.frames.numbered_files import frames_or_missing, numbered_files, stack_or_none
 from clra.io.frames.stacks import RawLayout
 from clra.io.key_value_text import KeyValueText
 from clra.io.scanners.scanner_options import ScannerOptions
@@ -32,9 +33,6 @@ from clra.io.scanners.scanner_scan import (
     ScannerScan,
     assembled,
     assumed,
-    frames_or_missing,
-    numbered_files,
-    stack_or_none,
     unverified,
 )
 from clra.io.scanners.stage import stage_geometry

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,6 @@ from clra.io.frames.frame_views import (
     divided,
     mirrored,
 )
-from clra.io.frames.stacks import FrameStack, RawLayout
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.model.detector_pose import flipped, mirrored_axes, reversed_axes, with_axis_at
 from clra.model.geometry import ConeBeamGeometry
@@ -31,7 +28,6 @@ from clra.model.rotation_sense import opposite_rotation
 from clra.model.scan import Scan
 
 Frames = Any
-TIFF_LAYOUT = RawLayout()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,56 +273,6 @@ def unverified(what: str, option: str, effect: str = "turns it") -> Finding:
 def assumed(what: str, advice: str = "") -> Finding:
     """Return the finding that something the metadata do not tell was assumed."""
     return Finding("assumed", f"assumed: {what}", advice, "info")
-
-
-def numbered_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
-    """Return the files of a folder whose names match, with the number in the first group, sorted.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to look; there may be no such folder.
-    pattern : str
-        Regular expression of whole names, upper and lower case alike.
-    """
-    expression = re.compile(pattern, re.IGNORECASE)
-    names = sorted(os.listdir(folder)) if folder.is_dir() else []
-    matches = [(expression.fullmatch(name), name) for name in names]
-    return sorted((int(match[1]), folder / name) for match, name in matches if match)
-
-
-def frames_or_missing(
-    files: Iterable[Path],
-    shape: tuple[int, int, int],
-    path: Path,
-    expected: str,
-    layout: RawLayout = TIFF_LAYOUT,
-) -> Frames:
-    """Return the frames in files, or a stand-in where there are none.
-
-    Parameters
-    ----------
-    files : iterable of Path
-        In the order of the views.
-    shape : (int, int, int)
-        Of the radiographs, as the metadata tell it.
-    path : Path
-        The metadata.
-    expected : str
-        Which files were looked for.
-    layout : RawLayout
-        Of headerless files.
-    """
-    found = list(files)
-    if not found:
-        return MissingFrames(shape, f"{path}: radiographs: found none, expected {expected}")
-    return FrameStack(found, layout)
-
-
-def stack_or_none(files: Iterable[Path], layout: RawLayout = TIFF_LAYOUT) -> FrameStack | None:
-    """Return the frames in files, or None where there are none."""
-    found = list(files)
-    return FrameStack(found, layout) if found else None
 
 
 def _even(white: float, frames: Frames) -> NDArray[Any]:

@@ -1,6 +1,7 @@
 """Keys that are missing or broken: one line with file, field, what was found and expected."""
 
 import re
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -101,12 +102,39 @@ def test_threads_read_frames_of_many_files(tmp_path: Path) -> None:
 def test_frames_that_do_not_fit(tmp_path: Path) -> None:
     frames = np.full((vendor.VIEWS, *vendor.SHAPE), 0.5)
     path = vendor.write_skyscan(tmp_path, frames)
-    (tmp_path / "bone_0007.tif").unlink()
-    with pytest.raises(InputError, match="found 23 frames of 22 x 30, expected 24 of 22 x 30"):
+    tifffile.imwrite(tmp_path / "bone_0024.tif", np.zeros(vendor.SHAPE, np.uint16))
+    with pytest.raises(InputError, match="found 25 frames of 22 x 30, expected 24 of 22 x 30"):
         read_scan(path)
+    (tmp_path / "bone_0024.tif").unlink()
     tifffile.imwrite(tmp_path / "bone_0007.tif", np.zeros((3, 4), np.uint16))
     with pytest.raises(InputError, match=r"bone_0007\.tif: frame: found \(3, 4\)"):
         read_scan(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (vendor.write_nikon, "Lego_{:04d}.tif"), (vendor.write_skyscan, "bone_{:04d}.tif"),
+        (vendor.write_phoenix, "fly{:04d}.tif"), (vendor.write_tescan, "scan_{:06d}.tif"),
+    ],
+)  # fmt: skip
+def test_what_is_left_of_a_scan_keeps_its_angles(
+    write: Callable[..., Path], name: str, tmp_path: Path
+) -> None:
+    levels = np.linspace(0.1, 0.9, vendor.VIEWS)[:, None, None]
+    path = write(tmp_path, np.broadcast_to(levels, (vendor.VIEWS, *vendor.SHAPE)))
+    whole = read_scan(path)
+    first = int(not (tmp_path / name.format(0)).exists())
+    lost = [3, 21, 22, 23]
+    for view in lost:
+        (tmp_path / name.format(view + first)).unlink()
+    numbers = ", ".join(str(view + first) for view in lost)
+    with pytest.warns(ClraWarning, match=rf"4 of 24 radiographs are missing: numbers {numbers}:"):
+        rest = read_scan(path)
+    left = np.setdiff1d(np.arange(vendor.VIEWS), lost)
+    assert rest.geometry == whole.geometry.subset(left)
+    found = rest.projections[0 : len(left)][:, 4, 5]
+    np.testing.assert_allclose(found, levels.ravel()[left], atol=2e-5)
 
 
 def test_tables_that_are_too_short(tmp_path: Path) -> None:
