@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.io.damage import readable
 from clra.model.bad_pixels import Patches
 
 Floats = NDArray[np.float32]
@@ -170,6 +171,10 @@ class CountedRadiographs:
 
     def _read(self, start: int, count: int) -> NDArray[Any]:
         """Read consecutive frames as they are; refuse pixels that are no finite numbers."""
+        with readable(self._path):
+            return self._finite(start, count)
+
+    def _finite(self, start: int, count: int) -> NDArray[Any]:
         try:
             counts = np.asarray(self._frames[start : start + count])
         except (OSError, RuntimeError) as error:

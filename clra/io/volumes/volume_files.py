@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 import clra
 from clra.errors import InputError, OutputError
 from clra.io.atomic import atomic_path
+from clra.io.damage import reads
 from clra.io.hdf5 import open_hdf5, require, text
 from clra.io.provenance import Provenance
 from clra.io.units import TO_MM, factor
@@ -122,6 +123,7 @@ def write_volume(
             tell(progress, "writing", stop, planes)
 
 
+@reads
 def read_volume(
     path: str | os.PathLike[str], start: int = 0, stop: int | None = None
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
