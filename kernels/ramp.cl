@@ -29,7 +29,7 @@ static inline real weights_at(const LineWeight w, const int i)
     return w.factor / sqrt(w.quadratic + du * (w.linear + w.a * du));
 }
 
-kernel void weight_lines(
+kernel required_group void weight_lines(
     global float *restrict lines, // (count, padded)
     const ulong lines_offset,
     global const float *restrict projections, // (views, rows, columns), line integrals
@@ -84,7 +84,7 @@ kernel void weight_lines(
     }
 }
 
-kernel void cut_lines(
+kernel required_group void cut_lines(
     global float *restrict filtered, // (views, rows, columns)
     const ulong filtered_offset,
     global const float *restrict lines, // (count, padded)

@@ -156,9 +156,11 @@ class Reading:
 
     def scanner(self, path: Path) -> "ScannerScan | None":
         """Read the metadata of a scanner; None of an NXtomo file."""
-        from clra.io.scanners.recognise import read_scanner
+        from clra.io.scanners.recognise import read_scanner, recognise
         from clra.io.scanners.scanner_options import ScannerOptions
 
+        if recognise(path) is None:
+            return None
         options = ScannerOptions(
             rotation=self.rotation,
             source_distance=self.source_distance,

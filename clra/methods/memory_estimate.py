@@ -8,7 +8,7 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reprojection import band_of, with_margin
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.ops.projection.layout import view_elements
+from clra.ops.projection.layout import view_shape
 from clra.ops.registration.gauss_newton import pair_bytes
 from clra.ops.runtime.lines import line_stride
 from clra.ops.streaming.memory import Budgets
@@ -196,7 +196,10 @@ def _slab(budgets: Budgets, grid: VolumeGrid, volumes: int = 1) -> int:
 
 
 def _projecting(budgets: Budgets, geometry: ConeBeamGeometry, chunk: int) -> int:
-    """Bytes of padded lines in a projector."""
-    view, pixels = 4 * view_elements(geometry.shape), 4 * int(np.prod(geometry.shape))
+    """Bytes of padded lines in a projector; those of GPUs need none."""
+    if not budgets.profile.on_cpu:
+        return 0
+    pixels = 4 * int(np.prod(geometry.shape))
+    view = 4 * int(np.prod(view_shape(budgets.profile, geometry.shape)))
     most = max(1, _limited(budgets.profile.projector_bytes, budgets) // view)
     return view * min(most, max(1, chunk // pixels))

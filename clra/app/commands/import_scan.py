@@ -130,7 +130,7 @@ def import_scan(
     Examples
     --------
       clra import Lego.xtekct -o lego.nxs
-      clra import tooth.h5 --parallel --centre-offset -23.5 -o tooth.nxs
+      clra import tooth.h5 --parallel --centre-offset -24 -o tooth.nxs
       clra import 'scan/*.tif' --angles angles.txt --source-distance 4.36
         --detector-distance 432 --pixel-size 0.139 --flat flat.tif --dark dark.tif -o scan.nxs
       clra import frames.raw --shape 3040x3040 --angles 0:359.5:720 --source-distance 7.07

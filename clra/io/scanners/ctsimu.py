@@ -108,13 +108,13 @@ def _geometry(
     pitch = scenario.need("detector", "pixel_pitch")
     width, height = pitch.need("u").number("mm"), pitch.need("v").number("mm")
     rows = []
-    for stage, source, panel in zip(stages, sources, detectors, strict=True):
+    for stage, source, detector in zip(stages, sources, detectors, strict=True):
         rows.append(
             [
                 stage.axes @ (source.centre - stage.centre),
-                stage.axes @ (panel.centre - stage.centre),
-                stage.axes @ panel.axes[0] * width,
-                stage.axes @ panel.axes[1] * height,
+                stage.axes @ (detector.centre - stage.centre),
+                stage.axes @ detector.axes[0] * width,
+                stage.axes @ detector.axes[1] * height,
             ]
         )
     return ConeBeamGeometry.from_astra(np.array(rows).reshape(views, 12), shape)

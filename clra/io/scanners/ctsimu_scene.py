@@ -225,9 +225,6 @@ def _drift(amount: Json, native: str, progress: float, known_only: bool) -> floa
         values = [item.number() for item in drift.need("value").items()]
         factor = drift.factor(drift.unit(amount.unit(native)))
         place = progress * (len(values) - 1)
-        smooth = drift.get("interpolation")
-        if smooth is not None and smooth.value is False:
-            place = np.floor(place)
         total += factor * float(np.interp(place, np.arange(len(values)), values))
     return total
 

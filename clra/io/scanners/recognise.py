@@ -72,6 +72,7 @@ _COMPANIONS: tuple[tuple[re.Pattern[str], Callable[[Path], Path]], ...] = (
         lambda path: path.with_name(f"{path.name[: -len('_TS.csv')]}.log"),
     ),
 )
+_HDF5 = (".nxs", ".nx", ".h5", ".hdf5", ".hdf", ".nexus")
 _FRAMES = (".tif", ".tiff", ".raw", ".bin")
 NXTOMO = "NXtomo (.nxs, .h5)"
 
@@ -117,9 +118,7 @@ def recognise(path: str | os.PathLike[str]) -> tuple[Format, Path] | None:
             f"{place}: found frames, expected the metadata of a scanner or an NXtomo file; "
             "clra import makes one of frames and a table of angles"
         )
-    with place.open("rb") as stream:
-        start = stream.read(8)
-    if start == b"\x89HDF\r\n\x1a\n":
+    if suffix in _HDF5 or _is_hdf5(place):
         return None
     raise InputError.at(place, "format", f"suffix {suffix!r}", f"one of {formats_read()}")
 
@@ -193,6 +192,14 @@ def read_start_motion(
     if views is not None and motion.views != views:
         raise InputError.at(place, "start motion", f"{motion.views} views", f"{views}")
     return motion
+
+
+def _is_hdf5(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(8) == b"\x89HDF\r\n\x1a\n"
+    except OSError:
+        return True  # whoever opens it tells why it cannot be read
 
 
 def recognise_or_none(path: Path) -> tuple[Format, Path] | None:

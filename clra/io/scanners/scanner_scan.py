@@ -24,9 +24,8 @@ from clra.io.frames.frame_views import (
 )
 from clra.io.frames.stacks import FrameStack, RawLayout
 from clra.io.scanners.scanner_options import ScannerOptions
-from clra.model.detector_pose import with_axis_at
+from clra.model.detector_pose import flipped, mirrored_axes, reversed_axes, with_axis_at
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.image_flip import flipped, mirrored_axes, reversed_axes
 from clra.model.motion import Motion
 from clra.model.rotation_sense import opposite_rotation
 from clra.model.scan import Scan

@@ -12,8 +12,10 @@ from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.model.corrections.options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -45,6 +47,7 @@ def align(
     resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -92,6 +95,8 @@ def align(
         Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
 
     Returns
     -------
@@ -124,10 +129,6 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
-    if motion is not None:
-        motion = motion.about(*scan.window_offset)
-    truth = scan.truth if truth is None else truth
-    truth = None if truth is None else truth.about(*scan.window_offset)
     stream = Stream(
         device,
         max_device_memory=max_device_memory,
@@ -153,9 +154,15 @@ def align(
 
     scale = estimate != "shift"
     with collected() as findings:
+        scan = prepared(scan, corrections, progress=progress)
+        # What the mask leaves of the detector is aligned as a detector of its own.
+        part = scan.cropped()
+        motion = None if motion is None else motion.about(*scan.window_offset)
+        truth = scan.truth if truth is None else truth
+        truth = None if truth is None else truth.about(*scan.window_offset)
         if reference is not None:
             if reference.geometry.shape == scan.geometry.shape:
-                reference = replace(reference, mask=scan.mask).cropped()
+                reference = with_detector_of(scan, reference).cropped()
             drift = align_to_reference(stream, part, reference, scale=scale, truth=truth)
             if method == "reference":
                 return told(drift)

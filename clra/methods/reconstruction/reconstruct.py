@@ -14,6 +14,7 @@ from clra.methods.alignment.result import AlignmentResult
 from clra.methods.correction import corrected
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of
 from clra.methods.execution.several_devices import Work, on_devices
+from clra.methods.preparation import prepared
 from clra.methods.reconstruction import iterative
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.imgr_state import ImgrStep
@@ -22,6 +23,7 @@ from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevic
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
 from clra.model.angular_coverage import part_of_a_turn
+from clra.model.corrections.options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.helix.pi_intervals import heights_between
@@ -53,6 +55,7 @@ def reconstruct(
     resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
 ) -> NDArray[np.float32]:
     """Reconstruct a volume.
 
@@ -97,6 +100,8 @@ def reconstruct(
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used, see `Stream`. The volume that is returned
         comes on top: :func:`reconstruct_into` takes one larger than the memory.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
 
     Returns
     -------
@@ -129,6 +134,7 @@ def reconstruct(
         resume=resume,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
+        corrections=corrections,
     )
     return planes.volume
 
@@ -169,6 +175,7 @@ def reconstruct_into(
     resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
 ) -> Reconstruction:
     """Reconstruct a volume, and hand it on some planes at a time.
 
@@ -178,7 +185,7 @@ def reconstruct_into(
         Takes the planes, each once; `open_volume` gives one that writes a
         file.
     scan, method, grid, motion, align, device, alignment, valid_views, options, progress, \
-    checkpoint, resume, max_device_memory, max_host_memory
+    checkpoint, resume, max_device_memory, max_host_memory, corrections
         As :func:`reconstruct` takes them.
 
     Returns
@@ -204,6 +211,7 @@ def reconstruct_into(
     if keeping is not None and keeping.resume and options is None and not align:
         raise InputError(f"resume: found it with {method} alone, which keeps nothing on its way")
     with collected() as findings:
+        scan = prepared(scan, corrections, progress=progress)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
         grid = grid or default_grid(scan.geometry)

@@ -102,7 +102,7 @@ class Coverage:
         self._weights_of_views = to_device(context, self._view_weight)
         self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
         self.scratch_bytes = self._seen.nbytes
-        self._count = Step(context, "coverage.cl", "coverage", (16, 1, 1))
+        self._count = Step(context, "coverage.cl", "coverage", (16, 8, 1))
         self._normalise = Step(context, "coverage.cl", "normalise", (64, 1, 1))
         self._last: list[cl.Event] = []
         self.set_geometry(geometry)
