@@ -201,7 +201,8 @@ def _numbers(dataset: h5py.Dataset, name: str, default: tuple[float, ...]) -> li
         numbers = []
     if not numbers:
         where = f"{dataset.name}@{name}"
-        raise InputError.at(dataset.file.filename, where, repr(value), "numbers")
+        found = "nothing" if value is default else repr(value)
+        raise InputError.at(dataset.file.filename, where, found, "numbers")
     return numbers
 
 
