@@ -1,6 +1,5 @@
 """Make a scan of frames, or of a scanner's files."""
 
-import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,6 +9,7 @@ import typer
 from clra.app.arguments import axis_place, detector, pixel
 from clra.app.console import Console
 from clra.errors import InputError
+from clra.findings import warn
 
 if TYPE_CHECKING:
     from clra.io.scanners.scanner_scan import ScannerScan
@@ -231,8 +231,8 @@ def _import_scanner(console: Console, scanner: "ScannerScan", out: Path, *, flip
 
 
 def _warn_of_no_flats(out: Path) -> None:
-    warnings.warn(
+    warn(
+        "no-flats",
         f"{out} has no flats: every command that reads it needs --white COUNTS, and 1 if these "
         "radiographs are transmission already",
-        stacklevel=3,
     )

@@ -6,7 +6,6 @@ import glob
 import math
 import os
 import re
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import tifffile
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
+from clra.findings import warn
 
 Floats = NDArray[np.float64]
 Source = str | os.PathLike[str]
@@ -256,11 +256,11 @@ def warn_of_gaps(files: Sequence[Path]) -> None:
     gaps = [k for k, step in enumerate(steps) if step != usual]
     if gaps:
         k = gaps[0]
-        warnings.warn(
+        warn(
+            "missing-frames",
             f"{files[k].name} is followed by {files[k + 1].name}"
             f"{f', and {len(gaps) - 1} more such' if gaps[1:] else ''}: are frames missing or out "
             "of order? Angles go with frames as they come; a pattern in quotes sorts by number",
-            stacklevel=3,
         )
 
 
