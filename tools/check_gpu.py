@@ -10,6 +10,7 @@ skipped with one line, an error with ``--require``.
 """
 
 import argparse
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +40,13 @@ def forms(file: str) -> tuple[Mapping[str, int], ...]:
 
 
 def portable(file: str, folder: Path) -> Iterator[Usage]:
-    """Hold a file to OpenCL C 1.2 without extensions and without double precision."""
+    """Hold a file to OpenCL C 1.2 without extensions and without double precision.
+
+    Kernels that GPUs run have to be compiled for the work-groups that they run in.
+    """
+    loose = re.findall(r"^kernel void (\w+)", kernels.source(file), re.MULTILINE)
+    if loose and file not in CPU_ONLY:
+        raise RuntimeError(f"no work-group required of {', '.join(loose)}")
     options = ["-target", "spir64", "-Xclang", "-finclude-default-header"]
     options += ["-Xclang", "-cl-ext=-all", "-fsyntax-only", "-Wall", "-Wextra"]
     options += ["-Wdouble-promotion", "-Wno-unused-parameter", "-Werror"]

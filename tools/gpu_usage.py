@@ -12,6 +12,7 @@ from pathlib import Path
 
 from compilers import APT, clang, data, defined, program, run
 
+from clra.kernels.header import signatures
 from clra.ops.runtime.build import BUILD_OPTIONS
 
 MOST_REGISTERS = 64
@@ -19,6 +20,7 @@ MOST_REGISTERS = 64
 MORE_REGISTERS = {
     "normal_equations": (128, "36 sums of a work-item stay in registers"),
     "adjoint_axial": (72, "16 voxels share what a column of rays costs"),
+    "adjoint_leaning": (96, "8 voxels share what a column of rays costs"),
 }
 
 # How the operators run each file where the device is no CPU, see clra/ops: work-items of a group,
@@ -32,6 +34,7 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "coverage.cl": (128, {}),
     "fft.cl": (64, {}),
     "ramp.cl": (128, {"LANES": 2}),
+    "ramp_transform.cl": (256, {"LENGTH": 4096, "GROUP": 256}),
     "forwardproject.cl": (256, {"RAYS": 4, "COLUMNS": 1024, "NX": 1024, "NZ": 1024}),
     "katsevich_filter.cl": (128, {"LANES": 2}),
     "multigrid.cl": (64, {}),
@@ -43,8 +46,16 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),
 }
+# Kernels that are built otherwise than the rest of their file.
+KERNEL_FORMS: Mapping[str, Mapping[str, int]] = {"adjoint_leaning": {"VOXELS": 8}}
 # Kernels that run in other groups than the rest of their file.
-WORK_GROUPS: Mapping[str, int] = {"normalise": 64, "means": 256, "whiten": 256, "peak": 256}
+WORK_GROUPS: Mapping[str, int] = {
+    "normalise": 64,
+    "filter_pairs": 256,
+    "means": 256,
+    "whiten": 256,
+    "peak": 256,
+}
 # Two axes of the groups of that many work-items.
 SHAPES = {64: (64, 1), 128: (32, 4), 256: (32, 8)}
 
@@ -132,22 +143,28 @@ def nvidia_code(file: str, folder: Path, architecture: str, defines: Mapping[str
     return run([ptxas, "-v", f"-arch={architecture}", "-o", "k.cubin", "k.ptx"], folder)
 
 
-def grouped(file: str) -> dict[str, int]:
-    """Definitions of a file with those of its groups."""
+def grouped(file: str, kernel: str = "") -> dict[str, int]:
+    """Definitions of a file, or of one of its kernels, with those of the groups."""
     group, defines = GPU_FORMS[file]
     x, y = SHAPES[group]
-    return {"GROUP_X": x, "GROUP_Y": y, **defines}
+    return {"GROUP_X": x, "GROUP_Y": y, **defines, **KERNEL_FORMS.get(kernel, {})}
+
+
+def variants(file: str) -> Iterator[tuple[set[str], dict[str, int]]]:
+    """Kernels of a file that are built alike, and with which definitions."""
+    names = {one.name for one in signatures(file)}
+    for name in names & KERNEL_FORMS.keys():
+        yield {name}, grouped(file, name)
+    yield names - KERNEL_FORMS.keys(), grouped(file)
 
 
 def nvidia(file: str, folder: Path) -> Iterator[Usage]:
-    """Compile a file for each architecture; every kernel has to require its group."""
+    """Compile a file for each architecture."""
     for architecture, shared in _SHARED.items():
-        report = nvidia_code(file, folder, architecture, grouped(file))
-        kernels = re.split(r"\.entry ", (folder / "k.ptx").read_text())[1:]
-        loose = [one.partition("(")[0] for one in kernels if ".reqntid" not in one]
-        if loose:
-            raise RuntimeError(f"no work-group required of {', '.join(loose)}")
-        yield from read_ptxas(report, file, architecture, shared)
+        for names, defines in variants(file):
+            report = nvidia_code(file, folder, architecture, defines)
+            found = read_ptxas(report, file, architecture, shared)
+            yield from (one for one in found if one.kernel.split()[-1] in names)
 
 
 def read_ptxas(report: str, file: str, architecture: str, shared: int) -> Iterator[Usage]:
@@ -212,8 +229,10 @@ def amd_code(file: str, folder: Path, defines: Mapping[str, int], *output: str) 
 
 def amd(file: str, folder: Path) -> Iterator[Usage]:
     """Compile a file for gfx90a."""
-    report = amd_code(file, folder, grouped(file), "-c", "-o", "/dev/null")
-    yield from read_remarks(report, file)
+    for names, defines in variants(file):
+        report = amd_code(file, folder, defines, "-c", "-o", "/dev/null")
+        found = read_remarks(report, file)
+        yield from (one for one in found if one.kernel.split()[-1] in names)
 
 
 def read_remarks(report: str, file: str) -> Iterator[Usage]:

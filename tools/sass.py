@@ -87,6 +87,7 @@ class Loop:
 
     @property
     def size(self) -> int:
+        """Instructions of its own."""
         return self.own.total()
 
 
