@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.ops.filtering.fft import RealFFT, fast_length
+from clra.ops.filtering.ramp_transform import RampTransform, transform_length
 from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
 from clra.ops.runtime.kernel import Step
@@ -133,7 +134,29 @@ class RampFilter:
         self._context = context
         self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
         margin = math.ceil(_EXTENSION * self._columns) if extend else 0
-        self.padded = fast_length(context, 2 * (self._columns + margin), backend)
+        least = 2 * (self._columns + margin)
+        length = transform_length(context, least) if backend is None else None
+        self.padded = length or fast_length(context, least, backend)
+        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
+        self._view_weight = view_weights(view_weight, self._views)
+        self._roll = to_device(context, _roll(self.padded - self._columns, margin))
+        self._last: list[cl.Event] = []
+        self.set_geometry(geometry)
+        spectrum = _ramp_spectrum(self.padded, window)
+        self._transform = RampTransform(context, spectrum) if length else None
+        self.scratch_bytes = 0
+        if length is None:
+            self._in_steps(context, spectrum, backend, allocator, scratch_limit)
+
+    def _in_steps(
+        self,
+        context: cl.Context,
+        spectrum: NDArray[np.float32],
+        backend: str | None,
+        allocator: Allocator | None,
+        scratch_limit: int | None,
+    ) -> None:
+        """Prepare to weigh lines, to transform them and to cut them out."""
         self._lanes = profile_of(context).image_lanes
         most = within(profile_of(context).filter_bytes, scratch_limit) // (4 * self.padded)
         lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
@@ -144,12 +167,7 @@ class RampFilter:
         defines = {"LANES": self._lanes}
         self._weight = Step(context, "ramp.cl", "weight_lines", (64, 2), defines)
         self._cut = Step(context, "ramp.cl", "cut_lines", (64, 2), defines)
-        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
-        self._view_weight = view_weights(view_weight, self._views)
-        self._roll = to_device(context, _roll(self.padded - self._columns, margin))
-        self._ramp = to_device(context, _ramp_spectrum(self.padded, window))
-        self._last: list[cl.Event] = []
-        self.set_geometry(geometry)
+        self._ramp = to_device(context, spectrum)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
         """Take a geometry of the same views and shape, for example with another motion.
@@ -203,6 +221,11 @@ class RampFilter:
         total = shape[0] * self._rows
         events = [*(wait_for or ()), *self._last]
         sizes = (self._columns, self.padded)
+        if self._transform is not None:
+            tables = self._view_table[start:], self._row_weight, self._roll
+            event = self._transform(queue, filtered_out, projections, tables, events)
+            self._last = [event]
+            return event
         for first in range(0, total, len(self._lines)):
             count = min(len(self._lines), total - first)
             part = self._lines[:count]
