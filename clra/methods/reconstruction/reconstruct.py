@@ -175,7 +175,7 @@ def reconstruct_into(
     if method == "fbp":
         notes = [part_of_a_turn(scan.geometry), steep_rows(scan.geometry)]
     if method != "katsevich":  # that refuses such samples
-        notes.append(truncated(Radiographs(stream, scan, 1)))
+        notes.append(truncated(Radiographs(stream, scan, 1), scan.geometry))
     for note in filter(None, notes):
         warnings.warn(note, stacklevel=2)
     if method in iterative.METHODS:
