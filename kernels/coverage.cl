@@ -10,7 +10,9 @@
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
 // normalise one a voxel, along the volume's axes from last to first.
 
-kernel void coverage(
+#include "group.clh"
+
+kernel required_group void coverage(
     global float *restrict seen, // W, (ny, nx, nz) of the coarse grid
     const ulong seen_offset,
     global const float *restrict matrices, // (views, 12), from coarse (i, j, k, 1) to (a, b, g)
@@ -79,7 +81,7 @@ static inline int between(
     return low;
 }
 
-kernel void normalise(
+kernel required_group void normalise(
     global float *restrict volume, // (ny, nx, nz), or (nz, ny, nx) if slices is set
     const ulong volume_offset,
     global const float *restrict seen, // W, (coarse_y, coarse_x, coarse_z)

@@ -7,7 +7,7 @@
 #define LANES 1
 #endif
 
-#include "unaligned.clh"
+#include "vectors.clh"
 #include "gauss_newton.clh"
 
 // Weights of the cubic B-spline's four coefficients around a point f past the second, e = 1 - f,
@@ -17,19 +17,6 @@
      (2.0f / 3.0f) - (e) * (e) * (1.0f - 0.5f * (e)), (f) * (f) * (f) * (1.0f / 6.0f)}
 #define SPLINE_SLOPE(f, e)                                                                         \
     {-0.5f * (e) * (e), (f) * (1.5f * (f) - 2.0f), (e) * (2.0f - 1.5f * (e)), 0.5f * (f) * (f)}
-
-// weight of one coefficient, `x` past which the point lies, and its derivative
-static inline float spline_weight(const float x, float *slope)
-{
-    const float away = fabs(x), rest = fmax(2.0f - away, 0.0f);
-    const float decline = away < 1.0f ? away * (2.0f - 1.5f * away) : 0.5f * rest * rest;
-    *slope = x < 0.0f ? decline : -decline;
-    return away < 1.0f ? (2.0f / 3.0f) - away * away * (1.0f - 0.5f * away)
-                       : rest * rest * rest * (1.0f / 6.0f);
-}
-
-// sums that one of several work-items makes
-#define MINE ((SUMS + GROUP - 1) / GROUP)
 
 // A view's images and where it stands.
 typedef struct {
@@ -46,19 +33,18 @@ typedef struct {
 
 // The spline and its derivatives along x and y, u and f past the second of four by four
 // coefficients, whose first are those of column x - 1 and row y - 1.
-__attribute__((always_inline)) static inline void
-spline_at(const counterparts s, const int x, const int y, const floatn u, const float f, floatn *b,
-          floatn *p, floatn *q)
+inlined void
+spline_at(const counterparts s, const int x, const int y, const real u, const float f, real *b,
+          real *p, real *q)
 {
     *b = *p = *q = 0.0f;
-#if GROUP == 1
     const float wy[4] = SPLINE(f, 1.0f - f), sy[4] = SPLINE_SLOPE(f, 1.0f - f);
-    const floatn wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
+    const real wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
     for (int k = 0; k < 4; ++k) {
-        floatn value = 0.0f, slope = 0.0f;
+        real value = 0.0f, slope = 0.0f;
         for (int l = 0; l < 4; ++l) {
             const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
-            const floatn c = load_unaligned(s.coefficients + line + k);
+            const real c = load_global(s.coefficients + line + k);
             value += wy[l] * c;
             slope += sy[l] * c;
         }
@@ -66,32 +52,14 @@ spline_at(const counterparts s, const int x, const int y, const floatn u, const 
         *p += sx[k] * value;
         *q += wx[k] * slope;
     }
-#else // one weight after the other: sixteen would take a GPU's registers
-#pragma unroll 1
-    for (int k = 0; k < 4; ++k) {
-        float value = 0.0f, slope = 0.0f, weight, decline;
-#pragma unroll 1
-        for (int l = 0; l < 4; ++l) {
-            const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
-            const float c = s.coefficients[line + k];
-            weight = spline_weight(f - (l - 1), &decline);
-            value += weight * c;
-            slope += decline * c;
-        }
-        weight = spline_weight(u - (k - 1), &decline);
-        *b += weight * value;
-        *p += decline * value;
-        *q += weight * slope;
-    }
-#endif
 }
 
 // The terms of LANES pixels from (j, i) on; returns w. Each group of LANES columns takes the
 // spline's piece under its middle: in the outer ones the point lies up to LANES/2 |1/m - 1| beyond
 // the knot, where the piece differs from its neighbour by the cube of that only. So no lane loads
 // from an address of its own.
-__attribute__((always_inline)) static inline floatn
-terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
+inlined real
+terms_at(const counterparts s, const int j, const int i, real term[TERMS])
 {
     const float2 centre = 0.5f * (float2)(s.columns - 1, s.rows - 1);
     // Displacements, not positions, are interpolated at: they keep all their digits.
@@ -103,11 +71,11 @@ terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
         (i + 0.5f * (LANES - 1) - centre.x) * s.growth - s.shift.x * (1.0f + s.growth);
     // Far outside the detector all is 0 anyway.
     const int x = clamp(i + (int)floor(middle), -LANES - 4, s.columns + 3);
-    const floatn lanes = load_lanes(lane_numbers);
-    const floatn u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * s.growth;
-    floatn b, p, q;
+    const real lanes = RAMP;
+    const real u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * s.growth;
+    real b, p, q;
     spline_at(s, x, y, u, f, &b, &p, &q);
-    const floatn distance_u = (i - centre.x - s.shift.x + lanes) * (1.0f + s.growth);
+    const real distance_u = (i - centre.x - s.shift.x + lanes) * (1.0f + s.growth);
     term[0] = p;
     term[1] = q;
     term[2] = (p * distance_u + q * distance_v) * s.inverse_radius;
@@ -116,14 +84,13 @@ terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
     const int near = x + (middle - floor(middle) >= 0.5f);
     const int line = clamp(nearest, 0, s.rows - 1) * s.stride + MARGIN;
     const float used = nearest >= 0 && nearest < s.rows;
-    return used * load_unaligned(s.window + j * s.stride + MARGIN + i) *
-           load_unaligned(s.valid + line + near);
+    return used * load_global(s.window + j * s.stride + MARGIN + i) *
+           load_global(s.valid + line + near);
 }
 
 // Sums of the normal equations over blocks of rows. Work-group (GROUP, 1, 1), global size
-// (GROUP, blocks, views). On a CPU a work-item keeps all sums in its registers. A GPU's would not
-// hold them: there each work-item makes the terms of one pixel, and when all are there each makes
-// one of the sums.
+// (GROUP, blocks, views). A work-item keeps all sums of its pixels in its registers; those of a
+// group are added at the end.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     global float *restrict sums, // (views, blocks, SUMS)
     const ulong sums_offset,
@@ -168,58 +135,35 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
         inverse_radius};
     const int start = top + block * block_rows, stop = min(bottom, start + block_rows);
     sums += sums_offset + ((ulong)view * get_global_size(1) + block) * SUMS;
-    floatn term[TERMS];
-#if GROUP == 1
-    floatn sum[SUMS];
+    real term[TERMS];
+    real sum[SUMS];
     for (int k = 0; k < SUMS; ++k)
         sum[k] = 0.0f;
     for (int j = start; j < stop; ++j)
-        for (int i = left; i < right; i += LANES) {
-            const floatn w = terms_at(s, j, i, term);
+        for (int i = left + get_local_id(0) * LANES; i < right; i += GROUP * LANES) {
+            const real w = terms_at(s, j, i, term);
             for (int k = 0; k < BLURS; ++k)
-                term[5 + k] = load_unaligned(s.measured + k * s.blur + j * stride + MARGIN + i);
+                term[5 + k] = load_global(s.measured + k * s.blur + j * stride + MARGIN + i);
             for (int k = 0, at = 0; k < TERMS; ++k) {
-                const floatn weighted = w * term[k];
+                const real weighted = w * term[k];
                 for (int other = k; other < TERMS; ++other, ++at)
                     sum[at] += weighted * term[other];
             }
         }
+#if GROUP == 1
     for (int k = 0; k < SUMS; ++k)
         sums[k] = sum_lanes(sum[k]);
 #else
-    local float shared[TERMS * GROUP];
-    const int item = get_local_id(0), width = right - left;
-    // the two terms of each of this work-item's sums, one of 36 or more work-items
-    int one[MINE], other[MINE];
-    float sum[MINE];
-    for (int n = 0; n < MINE; ++n) {
-        one[n] = 0;
-        other[n] = item + n * GROUP;
-        for (; one[n] < TERMS && other[n] >= TERMS - one[n]; ++one[n])
-            other[n] -= TERMS - one[n];
-        other[n] += one[n];
-        sum[n] = 0.0f;
+    local float shared[SUMS][GROUP + 1]; // + 1: the sums lie in different banks
+    const int item = get_local_id(0);
+    for (int k = 0; k < SUMS; ++k)
+        shared[k][item] = sum[k];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int k = item; k < SUMS; k += GROUP) {
+        float total = 0.0f;
+        for (int n = 0; n < GROUP; ++n)
+            total += shared[k][n];
+        sums[k] = total;
     }
-    for (int first = 0; first < (stop - start) * width; first += GROUP) {
-        const int pixel = min(first + item, (stop - start) * width - 1);
-        const int j = start + pixel / width, i = left + pixel % width;
-        const float w = terms_at(s, j, i, term);
-        const float root = first + item == pixel ? sqrt(w) : 0.0f;
-        for (int k = 0; k < 5; ++k)
-            shared[k * GROUP + item] = root * term[k];
-        global const float *blurred = s.measured + (j * stride + MARGIN + i);
-        for (int k = 0; k < BLURS; ++k, blurred += s.blur)
-            shared[(5 + k) * GROUP + item] = root * *blurred;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (int n = 0; n < MINE; ++n)
-            if (one[n] < TERMS)
-#pragma unroll 1
-                for (int k = 0; k < GROUP; ++k)
-                    sum[n] += shared[one[n] * GROUP + k] * shared[other[n] * GROUP + k];
-        barrier(CLK_LOCAL_MEM_FENCE);
-    }
-    for (int n = 0; n < MINE; ++n)
-        if (one[n] < TERMS)
-            sums[item + n * GROUP] = sum[n];
 #endif
 }

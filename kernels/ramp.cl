@@ -2,13 +2,13 @@
 //
 // A line of detector row r is p(c) factor row_weight(r) ray_weight(c) / sqrt(1 + a du^2 + b dv^2 +
 // s du dv), du = c - c0 and dv = r - r0 pixels from the principal point: the root is the length of
-// the ray over the distance from source to detector. Past the detector a line runs out from its outermost
-// values, the last going right and, cyclically, the first going left, each times `roll`.
+// the ray over the distance from source to detector. Past the detector a line runs out from its
+// outermost values, the last going right and, cyclically, the first going left, each times `roll`.
 //
 // Lines are numbered through all views: line = view * rows + row. A work-item makes LANES columns
 // of one line. Global sizes are (blocks of LANES columns, lines), rounded up at will.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 #define VIEW_FIELDS 6 // c0, r0 [pixel], a, b, s [1/pixel^2], factor [1/mm]
 
@@ -23,13 +23,13 @@ static inline float weight_at(const LineWeight w, const int i)
 }
 
 // of LANES neighbouring columns from column i on
-static inline floatn weights_at(const LineWeight w, const int i)
+static inline real weights_at(const LineWeight w, const int i)
 {
-    const floatn du = (i - w.c0) + load_lanes(lane_numbers);
+    const real du = (i - w.c0) + RAMP;
     return w.factor / sqrt(w.quadratic + du * (w.linear + w.a * du));
 }
 
-kernel void weight_lines(
+kernel required_group void weight_lines(
     global float *restrict lines, // (count, padded)
     const ulong lines_offset,
     global const float *restrict projections, // (views, rows, columns), line integrals
@@ -72,8 +72,8 @@ kernel void weight_lines(
     ray_weight += (ulong)(source / rows) * ray_stride;
 
     if (i + LANES <= columns) {
-        const floatn ray = load_unaligned(ray_weight + i);
-        store_unaligned(load_unaligned(p + i) * weights_at(w, i) * ray, lines);
+        const real ray = load_global(ray_weight + i);
+        store_global(load_global(p + i) * weights_at(w, i) * ray, lines);
         return;
     }
     // From here on columns lie left of the detector rather than right of it.
@@ -81,7 +81,7 @@ kernel void weight_lines(
     if (i >= columns && i + LANES <= padded && (i + LANES <= middle || i >= middle)) {
         const int from = i < middle ? columns - 1 : 0;
         const float value = p[from] * weight_at(w, from) * ray_weight[from];
-        store_unaligned(value * load_unaligned(roll + i - columns), lines);
+        store_global(value * load_global(roll + i - columns), lines);
         return;
     }
     const int last = min(LANES, padded - i);
@@ -92,7 +92,7 @@ kernel void weight_lines(
     }
 }
 
-kernel void cut_lines(
+kernel required_group void cut_lines(
     global float *restrict filtered, // (views, rows, columns), of a detector that may be wider
     const ulong filtered_offset,
     global const float *restrict lines, // (count, padded)
@@ -112,7 +112,7 @@ kernel void cut_lines(
     lines += (ulong)line * padded;
     const int from = i < before ? i - before + padded : i - before;
     if (i + LANES <= columns && from + LANES <= padded) {
-        store_unaligned(load_unaligned(lines + from), filtered);
+        store_global(load_global(lines + from), filtered);
         return;
     }
     for (int k = 0; k < min(LANES, columns - i); ++k)

@@ -7,13 +7,46 @@ from pathlib import Path
 import pyopencl as cl
 import pytest
 
-from clra.ops.runtime import build
-from clra.ops.runtime.devices import create_context
+from clra.errors import DeviceError
+from clra.ops.runtime import build, devices
+from clra.ops.runtime.profile import DeviceProfile, forced
+
+TESTS = Path(__file__).parent
+# Folders whose tests run kernels.
+_ON_A_DEVICE = ("app", "kernels", "methods", "ops", "tools")
+
+
+def pytest_report_header() -> str:
+    """Say which of the machine's devices is tested."""
+    try:
+        chosen = devices.choose_device()
+    except DeviceError as error:
+        return f"device: {error}"
+    return f"device: {chosen.name.strip()}, {chosen.platform.version.partition('  ')[0]}"
+
+
+@pytest.fixture(scope="session")
+def device_failure() -> str:
+    """What the device fails at in a process of its own; empty if it passes."""
+    try:
+        devices.usable_device()
+    except DeviceError as error:
+        return str(error)
+    return ""
+
+
+@pytest.fixture(autouse=True)
+def _skip_on_a_broken_device(request: pytest.FixtureRequest, device_failure: str) -> None:
+    # A compiler that aborts so fails one test, which is marked, and not the run.
+    folder = request.path.relative_to(TESTS).parts[0]
+    marked = request.node.get_closest_marker("broken_device")
+    if device_failure and folder in _ON_A_DEVICE and not marked:
+        pytest.skip(device_failure)
 
 
 @pytest.fixture(scope="session")
 def context() -> Iterator[cl.Context]:
-    context = create_context()
+    context = devices.create_context()
     builds = build.builds(context)  # held, so that the tests compile once
     yield context
     del builds
@@ -29,6 +62,13 @@ def unordered(context: cl.Context) -> cl.CommandQueue:
     """A queue that runs what it holds in any order that events allow."""
     flag = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
     return cl.CommandQueue(context, properties=flag)
+
+
+@pytest.fixture
+def form(request: pytest.FixtureRequest) -> Iterator[DeviceProfile]:
+    """Give every device the profile that a test is parametrised with."""
+    with forced(request.param):
+        yield request.param
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The paper's Section 3.2 in small: multigrid reconstruction without and with alignment inside.
+"""The paper's Section 3.2 scaled down: multigrid reconstruction without and with alignment inside.
 
 ``python tools/imgr_small.py`` reconstructs a simulated space-filling scan (SOD 7.068 mm, SDD 335.6
 mm, a twelfth of the paper's pixels and views) of two porous rocks end to end in an aluminium tube,

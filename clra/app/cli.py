@@ -4,8 +4,16 @@ from typing import Annotated
 
 import typer
 
-from clra.app.commands import commands_in, commands_out
-from clra.app.console import as_written
+from clra.app.commands.align import align
+from clra.app.commands.correct import correct
+from clra.app.commands.demo import demo
+from clra.app.commands.devices import devices
+from clra.app.commands.import_scan import import_scan
+from clra.app.commands.info import info
+from clra.app.commands.reconstruct import reconstruct
+from clra.app.commands.report import report
+from clra.app.commands.simulate import simulate
+from clra.app.console import as_written, command
 from clra.app.exit_status import Group
 
 app = typer.Typer(
@@ -55,8 +63,15 @@ def _clra(
         print(context.get_help())
 
 
-commands_in.register(app)
-commands_out.register(app)
+command(app, "devices")(devices)
+command(app, "info")(info)
+command(app, "import", writes=True)(import_scan)
+command(app, "simulate", writes=True)(simulate)
+command(app, "align", writes=True)(align)
+command(app, "reconstruct", writes=True)(reconstruct)
+command(app, "correct", writes=True)(correct)
+command(app, "report", writes=True)(report)
+command(app, "demo")(demo)
 
 
 def main() -> None:

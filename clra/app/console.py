@@ -18,8 +18,14 @@ import typer
 from clra.app import progress_bar
 
 if TYPE_CHECKING:
+    from clra.io.scanners.scanner_scan import ScannerScan
     from clra.model.scan import Scan
     from clra.progress import ProgressCallback
+
+
+ScanPath = Annotated[
+    Path, typer.Argument(metavar="SCAN", help="NXtomo file, or a scanner's metadata or folder.")
+]
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,15 @@ class Console:
         """Print what a command that wrote a file has to say of it, unless quiet."""
         if self.json or not self.quiet:
             self.result(values, text)
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How a command may write."""
+
+    no_overwrite: Annotated[
+        bool, typer.Option("--no-overwrite", help="Refuse to replace files that are there.")
+    ] = False
 
 
 @dataclass(frozen=True)
@@ -105,11 +120,28 @@ class Reading:
         str | None, typer.Option(metavar="NAME", help="Which scan, if the file holds several.")
     ] = None
     rotation: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="ccw|cw", help="How the sample turns as its angle grows, seen from above."
+            metavar="ccw|cw",
+            help="How the sample turns as its angle grows, seen from above; by default ccw, or as "
+            "the scanner's metadata have it.",
         ),
-    ] = "ccw"
+    ] = None
+    flip: Annotated[
+        str | None,
+        typer.Option(
+            metavar="columns|rows|both",
+            help="The radiographs are stored mirrored against what the file says.",
+        ),
+    ] = None
+    centre_offset: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLUMN[,ROW]",
+            help="Where the axis is seen, and the source's perpendicular, in pixels from the "
+            "detector's middle, in place of the file's.",
+        ),
+    ] = None
     source_distance: Annotated[
         float | None,
         typer.Option(metavar="MM", help="Source to rotation axis, in place of the file's."),
@@ -121,6 +153,29 @@ class Reading:
         float | None,
         typer.Option(metavar="COUNTS", help="Counts of the open beam, in place of flat frames."),
     ] = None
+
+    def scanner(self, path: Path) -> "ScannerScan | None":
+        """Read the metadata of a scanner; None of an NXtomo file."""
+        from clra.io.scanners.recognise import read_scanner, recognise
+        from clra.io.scanners.scanner_options import ScannerOptions
+
+        if recognise(path) is None:
+            return None
+        options = ScannerOptions(
+            rotation=self.rotation,
+            source_distance=self.source_distance,
+            parallel=self.parallel,
+            white=self.white,
+            flip=self.flip,
+            centre_offset=self._axis(),
+        )
+        return read_scanner(path, options)
+
+    def _axis(self) -> tuple[float, ...] | None:
+        from clra.app.arguments import axis_place
+
+        text = self.centre_offset
+        return None if text is None else axis_place("--centre-offset", text)
 
     def scan(self, path: Path) -> "Scan":
         """Open a scan; its radiographs are read when they are needed."""
@@ -134,6 +189,8 @@ class Reading:
             source_distance=self.source_distance,
             parallel=self.parallel,
             white=self.white,
+            flip=self.flip,
+            centre_offset=self._axis(),
         )
         warn_of_scale(scan)
         return scan
@@ -174,7 +231,9 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def command(
+    app: typer.Typer, name: str, *, writes: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a function as a command; groups of options among its parameters are spread out.
 
     Parameters
@@ -183,6 +242,9 @@ def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Call
         Where to.
     name : str
         What the command is called.
+    writes : bool
+        Whether it writes files: it has the options of :class:`Writing`, and its outputs are its own
+        until it ends.
 
     Returns
     -------
@@ -202,11 +264,20 @@ def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Call
                 shared += _options(group)
             else:
                 own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if writes:
+            shared += _options(Writing)
 
         def run(**values: Any) -> None:
             for key, group in groups.items():
                 values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
-            function(**values)
+            if not writes:
+                function(**values)
+                return
+            from clra.io.claims import one_run
+
+            writing = Writing(**{f.name: values.pop(f.name) for f in fields(Writing)})
+            with one_run(overwrite=not writing.no_overwrite):
+                function(**values)
 
         # typer learns a command's options from its signature and its annotations.
         run.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]

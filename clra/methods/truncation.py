@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.rejected_views import odd, sums_of
-from clra.model.field_of_view import is_offset, side_distances
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.sampling.field_of_view import is_offset, side_distances
 from clra.ops.streaming.radiographs import Radiographs
 
 # Views that are looked at, and the part of the largest line integral, as means over rows, that may

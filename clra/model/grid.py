@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
-from clra.model.field_of_view import field_radii
+from clra.model.sampling.field_of_view import field_radii
 from clra.model.validation import positive, whole
 
 if TYPE_CHECKING:
@@ -138,9 +138,9 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     A voxel is a pixel seen at the axis, |u| SOD / SDD (median over the views). In x and y the grid
     covers the circle about the axis that every view sees: its radius is the distance from the axis
     to the nearer of the planes through the source and a side of the detector, SOD sin(half fan); to
-    the farther one if the detector is offset (:func:`clra.model.field_of_view.is_offset`). In z it
-    covers the heights at which the axis is seen by at least half as many views as where it is seen
-    best.
+    the farther one if :func:`clra.model.sampling.field_of_view.is_offset`. In z it covers the
+    heights at which the axis is seen by at least half as many views as where it is seen best; of a
+    parallel beam without the planes of the outermost rows.
 
     Parameters
     ----------
@@ -170,6 +170,10 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     low, high = _axis_range(geometry)
     across = max(1, math.ceil(2 * radius / voxel - _SLACK))
     planes = max(1, math.ceil((high - low) / voxel - _SLACK))
+    if np.allclose(magnified, 1.0, rtol=1e-9):
+        # Of a far source that stands for a parallel beam, the outermost rows are seen at half of
+        # their planes only, where these lie before the axis.
+        planes = max(1, planes - 2)
     middle = 0.5 * (low + high)
     # A scan about z = 0 gets a grid about z = 0, not about what rounding left.
     z = middle if abs(middle) > _SLACK * voxel else 0.0

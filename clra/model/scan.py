@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
-from clra.model.bad_pixels import Patches
+from clra.model.corrections.corrections import Corrections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.validation import selection
@@ -57,7 +58,10 @@ class Scan:
         The motion that a simulation put in.
     mask : array_like of bool, (rows, columns), optional
         True where the detector's pixels may be used. What the others hold is never used, be it NaN:
-        they are filled from beside.
+        they are interpolated from their neighbours.
+    corrections : Corrections, optional
+        What is corrected in the line integrals as they are read; see
+        :func:`clra.methods.preparation.prepared`, which finds out.
 
     Raises
     ------
@@ -71,6 +75,7 @@ class Scan:
     name: str = field(default="scan", kw_only=True)
     truth: Motion | None = field(default=None, kw_only=True)
     mask: NDArray[np.bool_] | None = field(default=None, kw_only=True)
+    corrections: Corrections | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         expected = (self.geometry.views, *self.geometry.shape)
@@ -95,6 +100,8 @@ class Scan:
                 )
             mask.flags.writeable = False
             object.__setattr__(self, "mask", mask)
+        if self.corrections is not None:
+            self.corrections.check(self.shape, self.name)
 
     @property
     def views(self) -> int:
@@ -141,16 +148,26 @@ class Scan:
         if self.kind == "transmission":
             self._warn_of_dark(pixels)
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
-        if self._patches is not None:
-            pixels = pixels.copy()
-            for image in pixels:
-                self._patches.fill(image)
+        if self._all_corrections is not None:
+            pixels = self._all_corrections.apply(pixels, start)
         # One such pixel would spread over the whole volume through filter and back-projection.
         finite = np.isfinite(pixels).all(axis=(1, 2))
         if not finite.all():
             view = start + int(np.argmin(finite))
             raise InputError(f"{self.name}: view {view}: found a pixel that is no finite number")
         return pixels
+
+    def checksum(self) -> str:
+        """Return a checksum by which an alignment can be matched to its scan.
+
+        SHA-256 over the shape and three radiographs (first, middle, last): a whole scan of many GB
+        would take longer to read than to align.
+        """
+        digest = hashlib.sha256(repr(self.shape).encode())
+        for view in sorted({0, self.views // 2, self.views - 1}):
+            pixels = np.ascontiguousarray(self.projections[view : view + 1], dtype="<f4")
+            digest.update(pixels.tobytes())
+        return f"sha256:{digest.hexdigest()}"
 
     def _warn_of_dark(self, transmission: NDArray[np.float32]) -> None:
         dark = transmission <= _DARKEST
@@ -165,8 +182,19 @@ class Scan:
             )
 
     @cached_property
-    def _patches(self) -> Patches | None:
-        return None if self.mask is None or self.mask.all() else Patches(~self.mask)
+    def _all_corrections(self) -> Corrections | None:
+        if self.mask is None or self.mask.all():
+            return self.corrections
+        return (self.corrections or Corrections()).masked(self.mask)
+
+    @property
+    def registration_mask(self) -> NDArray[np.bool_] | None:
+        """Pixels that registration may use, (rows, columns), or None if all.
+
+        Bad pixels whose neighbours tell their values, on thin lines too, do no harm.
+        """
+        unreliable = None if self._all_corrections is None else self._all_corrections.unreliable
+        return None if unreliable is None else ~unreliable
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -215,6 +243,9 @@ class Scan:
             name=self.name,
             truth=None if self.truth is None else self.truth.about(offset_u, offset_v),
             mask=None if mask.all() else mask,
+            corrections=None
+            if self.corrections is None
+            else self.corrections.cropped(rows, columns),
         )
 
     def subset(self, index: slice | ArrayLike) -> Scan:
@@ -233,6 +264,7 @@ class Scan:
             name=self.name,
             truth=None if self.truth is None else self.truth.subset(index),
             mask=self.mask,
+            corrections=None if self.corrections is None else self.corrections.subset(chosen),
         )
 
 

@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from alignments import keep_motion
 
+from clra.io.alignment_file import read_alignment
 from clra.io.scan_files import read_scan
 from clra.io.volumes.volume_files import read_volume, write_volume
 from clra.model.grid import default_grid
@@ -77,14 +79,13 @@ def test_resumed_to_the_bit(clra, scan_file, tmp_path, stopping):
     done = clra("reconstruct", scan_file, "-o", out, *options)
     refused(done, 130, "volume.h5.resume", "keeps cycle 1 up to HR", "--resume")
     assert not out.exists()
-    half, _ = read_volume(tmp_path / "volume.h5.resume" / "volume.h5")
-    assert half.std() > 0
+    assert np.load(tmp_path / "volume.h5.resume" / "1.npy").std() > 0
     stopping(None)
     done = clra("reconstruct", scan_file, "-o", out, "--method", "imgr", "--resume")
-    refused(done, 2, "motion.h5", "/@settings")
+    refused(done, 2, "state.json", "expected")
     # The file is the same, but it is read with another geometry.
     done = clra("reconstruct", scan_file, "-o", out, *options, "--rotation", "cw", "--resume")
-    refused(done, 2, "motion.h5", "/@settings")
+    refused(done, 2, "state.json", "expected")
     code, told, err = clra("reconstruct", scan_file, "-o", out, *options, "--resume", "--json")
     assert code == 0, err
     assert [step["level"] for step in json.loads(told)["steps"]][:2] == ["HR", "FR"]
@@ -95,13 +96,13 @@ def test_resumed_to_the_bit(clra, scan_file, tmp_path, stopping):
 def test_another_motion_is_not_gone_on_with(clra, scan_file, tmp_path, stopping):
     out, first, second = (tmp_path / name for name in ("volume.h5", "one.h5", "two.h5"))
     scan = read_scan(scan_file)
-    Motion.identity(scan.views).save(first)
-    Motion(shift_u=np.ones(scan.views), shift_v=np.zeros(scan.views)).save(second)
+    keep_motion(first, Motion.identity(scan.views))
+    keep_motion(second, Motion(shift_u=np.ones(scan.views), shift_v=np.zeros(scan.views)))
     options = ("reconstruct", scan_file, "-o", out, "--method", "imgr", "--levels", "HR-FR")
     stopping(1)
     assert clra(*options, "--motion", first)[0] == 130
     stopping(None)
-    refused(clra(*options, "--motion", second, "--resume"), 2, "motion.h5", "/@settings")
+    refused(clra(*options, "--motion", second, "--resume"), 2, "state.json", "expected")
     assert clra(*options, "--motion", first, "--resume")[0] == 0
 
 
@@ -110,7 +111,7 @@ def test_another_motion_is_not_gone_on_with(clra, scan_file, tmp_path, stopping)
     [
         (["--subsets", 3], ["subsets", "fbp does not have"]),
         (["--method", "osem-tr", "--levels", "QR-HR-FR"], ["levels", "osem-tr does not have"]),
-        (["--method", "osem-tr", "--resume"], ["--resume", "expected imgr"]),
+        (["--method", "fbp", "--resume"], ["--resume", "expected osem-tr, imgr or --align"]),
         (["--method", "osem-tr", "--update", "newton"], ["update", "'newton'", "paraboloid"]),
         (["--method", "osem-tr", "--i0", -5], ["i0", "found -5", "photons"]),
         (["--method", "osem-tr", "--subsets", 25], ["subsets", "found 25", "at most 24"]),
@@ -126,3 +127,26 @@ def test_wrong_options_are_refused(clra, scan_file, tmp_path, options, parts):
 def test_a_volume_of_other_methods_is_refused(clra, scan_file, tmp_path):
     done = clra("align", scan_file, "-o", tmp_path / "m.h5", "--volume", tmp_path / "v.h5")
     refused(done, 2, "--volume", "expected imgr")
+
+
+def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
+    out, folder = tmp_path / "m.h5", tmp_path / "m.h5.resume"
+    command = ("align", scan_file, "-o", out, "--schedule", "3HR")
+
+    def stop(error):
+        def report(self, stage, done, total):
+            if (folder / "1.npz").exists():
+                raise error
+
+        monkeypatch.setattr(Stream, "report", report)
+
+    stop(MemoryError("too many voxels"))
+    done = clra(*command)
+    refused(done, 1, "too many voxels; ", folder, "keeps 1 iteration, the last at HR, --resume")
+    assert not out.exists()
+    stop(KeyboardInterrupt())
+    refused(clra(*command, "--resume"), 130, out, "keeps what 1 iteration", "--resume goes on")
+    assert len(read_alignment(out).history) == 1
+    monkeypatch.undo()
+    assert clra(*command, "--resume", "--quiet") == (0, "", "")
+    assert len(read_alignment(out).history) == 3 and not folder.exists()

@@ -7,7 +7,7 @@ import numpy as np
 from clra.app.report import page, pictures
 
 if TYPE_CHECKING:
-    from clra.app.report.comparison import Comparison, Match
+    from clra.app.report.comparison import Comparison, MatchedView
 
 _WITHOUT_SCAN = (
     "Slices and re-projections need the scan: clra report MOTION.h5 --scan SCAN -o report.html"
@@ -61,7 +61,7 @@ def before_and_after(comparison: "Comparison | None") -> list[str]:
     return [slices, page.section("Measured radiographs and their re-projections", *shown)]
 
 
-def _match(match: "Match", pixel_mm: float) -> str:
+def _match(match: "MatchedView", pixel_mm: float) -> str:
     before, after = match.difference.before, match.difference.after
     reach = max(float(np.percentile(np.abs(before), 99.5)), 1e-6)
     grey = pictures.grey_limits(match.measured)

@@ -44,7 +44,7 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Match:
+class MatchedView:
     """A measured radiograph and what is left of it when its re-projection is taken off.
 
     Attributes
@@ -78,7 +78,7 @@ class Comparison:
         Edge of a pixel in them.
     method : str
         What reconstructed them, for reading.
-    matches : tuple of Match
+    matches : tuple of MatchedView
         Some views.
     pixel_mm : float
         Edge of a pixel in those, at the sample.
@@ -89,7 +89,7 @@ class Comparison:
     detail: Pair
     voxel_mm: float
     method: str
-    matches: tuple[Match, ...]
+    matches: tuple[MatchedView, ...]
     pixel_mm: float
 
 
@@ -182,7 +182,7 @@ def _matches(
     motion: Motion,
     confidence: NDArray[np.float64],
     valid_views: NDArray[np.bool_],
-) -> tuple[Match, ...]:
+) -> tuple[MatchedView, ...]:
     chosen = _views_worth_showing(motion, confidence)
     views = sorted(chosen)
     measured = np.concatenate([radiographs.read(slice(view, view + 1)) for view in views])
@@ -200,7 +200,7 @@ def _matches(
             [_without_background(m - s) for m, s in zip(measured, pairs, strict=True)]
         )
     return tuple(
-        Match(
+        MatchedView(
             view=view,
             why=chosen[view],
             measured=measured[k],

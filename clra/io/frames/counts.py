@@ -22,7 +22,7 @@ _SATURATED = 0.01
 _DEAD = 0.5
 
 
-class Radiographs:
+class CountedRadiographs:
     """Transmission (views, rows, columns) of a scan, computed from counts as it is sliced.
 
     ``(counts - dark) / (flat - dark)``, with the mean of the dark frames and a flat that runs

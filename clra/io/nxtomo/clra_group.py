@@ -107,7 +107,8 @@ def read_truth(entry: h5py.Group, views: Views, count: int) -> Motion | None:
         if not isinstance(dataset, h5py.Dataset):
             return None
         columns[name] = _rows(dataset, views, (count,))
-        cause = text(dataset.parent.attrs.get("cause", cause)).replace("panel", "detector")
+        told = text(dataset.parent.attrs.get("cause", cause))
+        cause = told.replace("panel", "detector")  # as version 0.1.0 wrote
     try:
         return Motion(**columns, cause=cause)
     except ValueError as error:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
-from clra.io.frames.counts import Radiographs
+from clra.io.frames.counts import CountedRadiographs
 from clra.io.hdf5 import find, numbers, open_hdf5, require, text
 from clra.io.nxtomo.clra_group import KIND_ATTRIBUTE, KINDS, read_mask, read_truth, read_vectors
 from clra.io.nxtomo.entry import scan_detector, scan_entry
@@ -64,7 +64,7 @@ def read_nxtomo(
     if kind not in KINDS:
         where = f"{frames.name}@{KIND_ATTRIBUTE}"
         raise InputError.at(file.filename, where, repr(kind), f"one of {KINDS}")
-    projections = Radiographs(
+    projections = CountedRadiographs(
         frames,
         path=os.fspath(path),
         views=views,

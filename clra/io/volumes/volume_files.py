@@ -12,9 +12,11 @@ import h5py
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+import clra
 from clra.errors import InputError, OutputError
 from clra.io.atomic import atomic_path
 from clra.io.hdf5 import open_hdf5, require, text
+from clra.io.provenance import Provenance
 from clra.io.units import TO_MM, factor
 from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.io.volumes.tiff import tiff_layout, tiff_volume
@@ -30,7 +32,11 @@ _PIECE = 8 << 20
 
 @contextmanager
 def open_volume(
-    path: str | os.PathLike[str], grid: VolumeGrid, *, units: str = "1/mm"
+    path: str | os.PathLike[str],
+    grid: VolumeGrid,
+    *,
+    units: str = "1/mm",
+    provenance: Provenance | None = None,
 ) -> Iterator[SlabWriter]:
     """Open a volume for writing slab by slab; the file appears whole or not at all.
 
@@ -42,6 +48,9 @@ def open_volume(
         Of the whole volume.
     units : str
         Of the voxels.
+    provenance : mapping of str to str, optional
+        Where the volume comes from, see :func:`clra.io.provenance.provenance`: attributes of the
+        root in HDF5, a line of the description in TIFF. The version of clra is kept in any case.
 
     Yields
     ------
@@ -63,7 +72,8 @@ def open_volume(
     size = 4 * int(np.prod(grid.shape, dtype=np.int64))
     with atomic_path(path, size + (1 << 20)) as temporary:
         lay_out = _hdf5_layout if suffix in HDF5 else tiff_layout
-        offset, dtype = lay_out(temporary, grid, units)
+        made = {"clra_version": clra.__version__, **(provenance or {})}
+        offset, dtype = lay_out(temporary, grid, units, made)
         with SlabWriter(temporary, offset, grid.shape, dtype) as writer:
             yield writer
 
@@ -74,6 +84,7 @@ def write_volume(
     grid: VolumeGrid,
     *,
     units: str = "1/mm",
+    provenance: Provenance | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write a volume; the file appears whole or not at all.
@@ -88,6 +99,8 @@ def write_volume(
         Of the volume.
     units : str
         Of the voxels.
+    provenance : mapping of str to str, optional
+        As for :func:`open_volume`.
     progress : callable, optional
         Called with a ``Progress`` as planes are written.
 
@@ -102,7 +115,7 @@ def write_volume(
         raise InputError(f"volume: found shape {volume.shape}, expected {grid.shape} as in grid")
     planes, rows, columns = grid.shape
     step = max(1, _PIECE // (4 * rows * columns))
-    with open_volume(path, grid, units=units) as writer:
+    with open_volume(path, grid, units=units, provenance=provenance) as writer:
         for start in range(0, planes, step):
             stop = min(start + step, planes)
             writer.write(start, np.asarray(volume[start:stop]))
@@ -141,9 +154,12 @@ def read_volume(
     return _read_hdf5(path, slice(start, stop))
 
 
-def _hdf5_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLike]:
+def _hdf5_layout(
+    path: Path, grid: VolumeGrid, units: str, provenance: Provenance
+) -> tuple[int, DTypeLike]:
     """Write everything but the voxels; return where they go and as what."""
     with h5py.File(path, "w") as file:
+        file.attrs.update(provenance)
         dataset, offset = reserve(file, "volume", grid.shape, np.float32)
         dataset.attrs.update(
             units=units,

@@ -1,20 +1,26 @@
 """Find out how each radiograph moved: the choice of method, options and what they go with."""
 
+import os
 from dataclasses import replace
 from typing import Any
 
 from clra.errors import InputError
+from clra.findings import collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.model.corrections.options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
+from clra.ops.runtime.versions import versions
 from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
@@ -37,8 +43,11 @@ def align(
     progress: ProgressCallback | None = None,
     gauge: str = "anchored",
     solver: Solver | None = None,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
+    resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -79,17 +88,28 @@ def align(
         scan: it would go on and stretch the sample. "anchored" takes it out in each iteration.
     solver : Solver, optional
         Parts of the iteration, to switch some off.
+    checkpoint : path-like, optional
+        Folder that keeps each finished iteration, so that an interruption of any kind loses none;
+        removed at success. A :class:`Checkpoint` is left to who made it.
+    resume : bool
+        Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
 
     Returns
     -------
     AlignmentResult
+        Of the iterations that were finished, with a warning, if `progress` raised ``Cancelled``.
 
     Raises
     ------
     InputError
-        If an option is none of its choices or the scan has less than two views.
+        If an option is none of its choices, the scan has less than two views, or the checkpoint is
+        of another scan or of other options.
+    Cancelled
+        If `progress` raised it before anything was finished.
     AlignmentInterrupted
         On Ctrl-C after at least one iteration; carries the result so far.
 
@@ -99,63 +119,100 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    keeping, own = checkpoint_of(checkpoint, resume)
+    # What the mask leaves of the detector is aligned as a detector of its own.
+    part = scan.cropped()
+    stages = parse_schedule(schedule, part.geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
         if given is not None and given.views != scan.views:
             raise InputError(f"{name}: found {given.views} views, expected {scan.views}")
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
-    # What the mask leaves of the detector is aligned as a detector of its own.
-    whole, scan = scan, scan.cropped()
-    aside = whole.window_offset
-    stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
     stream = Stream(
         device,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
         report=progress,
     )
-    truth = scan.truth if truth is None else truth.about(*aside)
-    motion = None if motion is None else motion.about(*aside)
-    if reference is not None:
-        if reference.geometry.shape == whole.geometry.shape:
-            reference = replace(reference, mask=whole.mask).cropped()
-        drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
-        if method == "reference":
-            return _on_detector(drift, whole)
-        motion = drift.motion
-    grid = grid or default_grid(scan.geometry)
-    solver, anchor = solver or Solver(), gauge == "anchored"
-    scale = estimate != "shift" and solver.estimator == "gauss-newton"
-    start = motion or Motion.identity(scan.views)
-    start = start.caused_by("source" if estimate == "source" else "detector")
-    try:
-        if method == "imgr":
-            solved = _by_imgr(
-                stream,
-                scan,
-                grid,
-                levels=schedule,
-                align=True,
-                scale=scale,
-                anchor=anchor,
-                motion=start,
-                truth=truth,
-            )
-            return _on_detector(solved, whole)
-        run = CoarseToFine(
-            stream, scan, with_margin(grid), schedule, scale, anchor, solver, start, truth
+    anchor = gauge == "anchored" and method != "reference"
+
+    def told(result: AlignmentResult) -> AlignmentResult:
+        """Add what is known of any run, for the whole detector."""
+        offset_u, offset_v = scan.window_offset
+        return replace(
+            result,
+            motion=result.motion.about(-offset_u, -offset_v),
+            warnings=tuple(findings),
+            method=method,
+            estimate=estimate,
+            versions=versions(stream.device),
+            scan=scan.name,
+            checksum=scan.checksum(),
+            about={"unobservable": "taken out" if anchor else "left in"},
         )
-        run.align(stages)
-    except AlignmentInterrupted as stopped:
-        raise AlignmentInterrupted(_on_detector(stopped.result, whole)) from None
-    return _on_detector(run.result(), whole)
 
-
-def _on_detector(result: AlignmentResult, scan: Scan) -> AlignmentResult:
-    """Return a result for what the mask leaves as one for the whole detector."""
-    offset_u, offset_v = scan.window_offset
-    return replace(result, motion=result.motion.about(-offset_u, -offset_v))
+    scale = estimate != "shift"
+    with collected() as findings:
+        scan = prepared(scan, corrections, progress=progress)
+        # What the mask leaves of the detector is aligned as a detector of its own.
+        part = scan.cropped()
+        motion = None if motion is None else motion.about(*scan.window_offset)
+        truth = scan.truth if truth is None else truth
+        truth = None if truth is None else truth.about(*scan.window_offset)
+        if reference is not None:
+            if reference.geometry.shape == scan.geometry.shape:
+                reference = with_detector_of(scan, reference).cropped()
+            drift = align_to_reference(stream, part, reference, scale=scale, truth=truth)
+            if method == "reference":
+                return told(drift)
+            motion = drift.motion
+        start = motion or Motion.identity(scan.views)
+        start = start.caused_by("source" if estimate == "source" else "detector")
+        grid = grid or default_grid(part.geometry)
+        solver = solver or Solver()
+        scale = scale and solver.estimator == "gauss-newton"
+        saved = None
+        if keeping is not None:
+            options = {"method": method, "schedule": schedule, "estimate": estimate}
+            options |= {"gauge": gauge, "solver": repr(solver)}
+            saved = keeping.begin(identity(part, grid, options, motion=start))
+        try:
+            if method == "imgr":
+                aligned = _by_imgr(
+                    stream,
+                    part,
+                    grid,
+                    levels=schedule,
+                    align=True,
+                    scale=scale,
+                    anchor=anchor,
+                    motion=start,
+                    truth=truth,
+                    checkpoint=keeping,
+                    saved=saved,
+                )
+            else:
+                run = CoarseToFine(
+                    stream,
+                    part,
+                    with_margin(grid),
+                    schedule,
+                    scale,
+                    anchor,
+                    solver,
+                    start,
+                    truth,
+                    keeping,
+                )
+                run.align(stages, saved)
+                aligned = run.result()
+        except AlignmentInterrupted as stopped:
+            raise AlignmentInterrupted(told(stopped.result)) from None
+        result = told(aligned)
+    if own and keeping is not None and not cancelled(result.warnings):
+        keeping.clear()
+    return result
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:

@@ -102,7 +102,7 @@ def quality(
         unexplained.append(float(np.median(np.sqrt(1 - np.clip(found.correlation, 0, 1) ** 2))))
         gradients.append(_gradient(volume.to_host()))
     halves = []
-    for name, first in (("even views", 0), ("odd views", 1)):
+    for name, first in (("even views", 0), ("views between", 1)):
         # Of the valid ones: bad ones may well be every second view.
         half = np.flatnonzero(used)[first::2]
         part = Radiographs(stream, Scan(radiographs, after).subset(half), 1)

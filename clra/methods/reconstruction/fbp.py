@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from clra.methods.alignment.rejected_views import neighbour_weights
 from clra.methods.truncation import extension
-from clra.model.angular_coverage import angle_weights
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.redundancy import ray_weights
+from clra.model.sampling.angular_coverage import angle_weights
+from clra.model.sampling.ray_weights import ray_weights
 from clra.model.view_selection import runs, views_that_see
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage, around
@@ -43,7 +43,8 @@ def ramp_fbp(
     ramp-filtered radiograph, U_i the depth of x below the source, w_i the weight of the row that x
     falls on, and W = sum_i w_i the number of views that see x. For circles this is FDK [1]_: views
     that do not stand evenly have the weight of the angle that each stands for, and redundant rays
-    of short scans and offset detectors that of :class:`clra.model.redundancy.RayWeights`. Elsewhere
+    of short scans and offset detectors those of
+    :class:`clra.model.sampling.ray_weights.RayWeights`. Elsewhere
     intensities are a few per cent off, and edges are where they belong.
 
     Parameters

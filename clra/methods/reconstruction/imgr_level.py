@@ -28,7 +28,7 @@ from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
-Believed = NDArray[np.bool_]
+Bools = NDArray[np.bool_]
 
 # At the levels that are corrected, the device holds the volume and its correction.
 _VOLUMES = 2
@@ -80,7 +80,7 @@ class MultigridLevel:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Pixels of the binned detector that count."""
-        mask = self.scan.mask
+        mask = self.scan.registration_mask
         return binned_mask(
             np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask, self.factor
         )
@@ -89,7 +89,7 @@ class MultigridLevel:
         """Motions are in full-resolution pixels: absorb first, then bin."""
         return self.scan.geometry.with_motion(motion).binned(self.factor)
 
-    def first(self, motion: Motion, valid_views: Believed) -> Volume:
+    def first(self, motion: Motion, valid_views: Bools) -> Volume:
         """Return the volume to start from: steps 1 and 2."""
         return start_volume(
             self.stream,
@@ -174,7 +174,7 @@ class MultigridLevel:
         grid: VolumeGrid,
         *,
         moved: Floats | None,
-        valid_views: Believed,
+        valid_views: Bools,
         title: str,
     ) -> Volume:
         """Filter and back-project what the radiographs hold beyond simulated ones: steps 15, 21.
@@ -204,9 +204,7 @@ class MultigridLevel:
             volumes=self.volumes,
         )
 
-    def reconstruct(
-        self, volume: Volume, motion: Motion, valid_views: Believed, title: str
-    ) -> None:
+    def reconstruct(self, volume: Volume, motion: Motion, valid_views: Bools, title: str) -> None:
         """Raise the likelihood of the volume by OSEM-TR: step 9."""
         osem_tr(
             self.stream,

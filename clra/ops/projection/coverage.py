@@ -10,15 +10,14 @@ from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
 from clra.errors import InputError
-from clra.model.field_of_view import field_radii
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.redundancy import RayWeights
+from clra.model.sampling.field_of_view import field_radii
+from clra.model.sampling.ray_weights import RayWeights
 from clra.ops.filtering.ramp import FADE
 from clra.ops.projection.view_arguments import check_geometry, view_weights
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device
+from clra.ops.runtime.kernel import Step
 
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
 # rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
@@ -113,7 +112,7 @@ class Coverage:
         self._rays = ray_weights
         self._seen = Scratch(context, allocator).empty(self._coarse[1::-1] + self._coarse[2:])
         self.scratch_bytes = self._seen.nbytes
-        self._count = Step(context, "coverage.cl", "coverage", (16, 1, 1))
+        self._count = Step(context, "coverage.cl", "coverage", (16, 8, 1))
         self._normalise = Step(context, "coverage.cl", "normalise", (64, 1, 1))
         self._last: list[cl.Event] = []
         self.set_geometry(geometry)
@@ -161,7 +160,7 @@ class Coverage:
         -------
         cl.Event
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         nx, ny, nz = self._coarse
         event = self._count(
             queue,
@@ -222,13 +221,13 @@ class Coverage:
         TypeError, InputError
             If the volume is not of this grid.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         planes, ny, nx = self._grid.shape
         slices = volume_order == "zyx"
         if getattr(volume, "ndim", 0) == 3:
             planes = min(planes - first, volume.shape[0 if slices else 2])
         shape = (planes, ny, nx) if slices else (ny, nx, planes)
-        build.check_array("volume", volume, shape, context=self._context)
+        check_array("volume", volume, shape, context=self._context)
         x, y, _ = self._grid.coordinates()
         size = self._grid.voxel_size
         event = self._normalise(

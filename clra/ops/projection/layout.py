@@ -16,17 +16,12 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.projection.transpose import Planes, Transpose
 from clra.ops.projection.view_arguments import check_geometry, successive
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-from clra.ops.runtime.kernel import to_device
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
+from clra.ops.runtime.profile import DeviceProfile, profile_of
 
 _PAD = 24  # as in geometry.clh
 _PIECE = 32  # the most that kernels read from where they are, past the last line's end
 
-# Projections that one launch treats. They have to stay in the last cache of a CPU, and few launches
-# have to read and write the volume.
-_CPU_BYTES = 24 << 20
-_GPU_BYTES = 256 << 20
 _LEAST_VIEWS = 8
 
 
@@ -43,21 +38,24 @@ class Layout:
         Of the volume.
     volume_order : {"zyx", "yxz"}
         Order of the caller's volume.
-    lanes : {1, 8, 16}, optional
-        Form of the kernels, the one for the device by default; the others serve tests.
-    tilted : bool
-        Treat axial views as tilted ones; serves tests.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
     scratch_limit : int, optional
         Bytes of scratch for projections; fewer views are treated at a time, at least one.
+    weighs : bool
+        Whether projections are changed before they are used, so that a GPU too needs scratch for
+        them; CPUs always do.
 
     Attributes
     ----------
-    lanes : int
-        As above.
+    profile : DeviceProfile
+        Of the context.
+    lanes : {1, 8, 16}
+        Its ``projector_lanes``.
     columnar : bool
-        Whether the kernels for columns apply, to a CPU and v parallel to z.
+        Whether the kernels for v parallel to z apply, where besides no ray is steep.
+    heights : ndarray
+        (views, 2) voxels along z that each view sees: the first, and one past the last.
     steep : bool
         Whether rays may advance fastest along z.
     table : Array
@@ -78,30 +76,31 @@ class Layout:
         geometry: ConeBeamGeometry,
         grid: VolumeGrid,
         volume_order: str,
-        lanes: int | None = None,
-        tilted: bool = False,
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
+        *,
+        weighs: bool = False,
     ) -> None:
-        cpu = build.is_cpu(build.device_of(context))
+        self.profile = profile = profile_of(context)
         self.context = context
         self.grid = grid
-        self.lanes = lanes or _best_lanes(build.device_of(context))
+        self.lanes = profile.projector_lanes
         self.sizes = grid.shape[::-1]
-        self.detector = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
+        self.detector = (geometry.columns, geometry.rows, _pitch(geometry.rows))
+        self._view_shape = view_shape(self.profile, geometry.shape)
+        self._view_elements = self._view_shape[0] * self._view_shape[1]
         self.last: list[cl.Event] = []
         self._views = geometry.views
-        self._tilted = tilted
         self.volume_order = volume_order
         self._volume_shape = volume_shape(grid, volume_order)
-        self._bytes = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
+        self._bytes = within(profile.projector_bytes, scratch_limit)
         self._least = _LEAST_VIEWS if scratch_limit is None else 1
-        self._transpose = Transpose(context, min(self.lanes, 8))
+        self._transpose = Transpose(context)
         self._lines: Array | None = None
         self._volume: Array | None = None
         self._memory = Scratch(context, allocator)
         lines = min(geometry.views, self._most) * self._view_elements
-        self.scratch_bytes = 4 * (lines + _PIECE)
+        self.scratch_bytes = 4 * (lines + _PIECE) if profile.on_cpu or weighs else 0
         if volume_order == "zyx":
             self.scratch_bytes += 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
         self.set_geometry(geometry)
@@ -110,8 +109,9 @@ class Layout:
         """Take other vectors of the same views and detector."""
         check_geometry(geometry, (self._views, self.detector[1], self.detector[0]))
         self.table = to_device(self.context, view_table(geometry, self.grid))
-        self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
-        self.steep = not geometry.axial and _steep(geometry)
+        self.steep = _steep(geometry)
+        self.columnar = self.profile.columns and geometry.axial and not self.steep
+        self.heights = heights(geometry, self.grid)
 
     def check(
         self,
@@ -123,18 +123,12 @@ class Layout:
     ) -> tuple[int, int]:
         """Refuse what does not fit; first of the views, and one past the last."""
         start, stop = successive(views, self._views)
-        build.check_queue(queue, self.context)
+        check_queue(queue, self.context)
         columns, rows, _ = self.detector
-        build.check_array(names[0], volume, self._volume_shape, context=self.context)
+        check_array(names[0], volume, self._volume_shape, context=self.context)
         shape = (stop - start, rows, columns)
-        build.check_array(names[1], projections, shape, context=self.context)
+        check_array(names[1], projections, shape, context=self.context)
         return start, stop
-
-    @property
-    def _view_elements(self) -> int:
-        """Elements of a view's padded lines."""
-        columns, _, pitch = self.detector
-        return (columns + 1) * pitch
 
     @property
     def _most(self) -> int:
@@ -183,12 +177,11 @@ class Layout:
         )
 
     def scratch_projections(self, count: int) -> Array:
-        """Lines of `count` views, (count, columns + 1, pitch)."""
-        columns, _, pitch = self.detector
+        """Lines of `count` views, (count, columns + 1, pitch), on a GPU (count, rows, columns)."""
         if self._lines is None or len(self._lines) < count:
-            size = count * (columns + 1) * pitch
+            size = count * self._view_elements
             flat = self._memory.empty((size + _PIECE,))
-            self._lines = flat[:size].reshape(count, columns + 1, pitch)
+            self._lines = flat[:size].reshape(count, *self._view_shape)
         lines: Array = self._lines[:count]
         return lines
 
@@ -234,6 +227,16 @@ class Layout:
         return self._volume
 
 
+def _pitch(rows: int) -> int:
+    """Elements of a padded line."""
+    return 16 * -(-(rows + 2 * _PAD) // 16)
+
+
+def view_shape(profile: DeviceProfile, shape: tuple[int, int]) -> tuple[int, int]:
+    """Shape of a view of (rows, columns) in scratch: padded lines on CPUs."""
+    return (shape[1] + 1, _pitch(shape[0])) if profile.on_cpu else shape
+
+
 def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
     """Shape of a volume whose axes are in that order.
 
@@ -246,6 +249,26 @@ def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
         raise InputError(f"volume_order: found {order!r}, expected 'zyx' or 'yxz'")
     nz, ny, nx = grid.shape
     return (nz, ny, nx) if order == "zyx" else (ny, nx, nz)
+
+
+def heights(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.int64]:
+    """Voxels along z that each view sees, (views, 2): the first, and one past the last.
+
+    Those of axial views; of others all.
+    """
+    nz, ny, nx = grid.shape
+    if not geometry.axial:
+        return np.tile([0, nz], (geometry.views, 1))
+    matrices = geometry.projection_matrices() @ grid.index_to_world()
+    # The height at which a ray of row r passes is linear along x and y: corners are outermost.
+    b, g = matrices[:, 1, :, None], matrices[:, 2, :, None, None]
+    x, y = np.array([0.0, nx - 1, 0, nx - 1]), np.array([0.0, 0, ny - 1, ny - 1])
+    row = np.array([0.0, geometry.rows - 1])[:, None]
+    depth = g[:, 0] * x + g[:, 1] * y + g[:, 3]
+    at = (row * depth - (b[:, 0] * x + b[:, 1] * y + b[:, 3])[:, None]) / b[:, 2, None]
+    low = np.clip(np.floor(at.min(axis=(1, 2))), 0, nz)
+    high = np.clip(np.ceil(at.max(axis=(1, 2))) + 1, 0, nz)
+    return np.stack([low, high], axis=1).astype(np.int64)
 
 
 def _steep(geometry: ConeBeamGeometry) -> bool:
@@ -262,13 +285,6 @@ def _steep(geometry: ConeBeamGeometry) -> bool:
     nearest = np.sum(corners[:, :, :2] * level, axis=2).min(axis=0)
     highest = np.abs(corners[:, :, 2]).max(axis=0)
     return bool(np.any(1.0001 * highest > nearest / np.sqrt(2)))
-
-
-def _best_lanes(device: cl.Device) -> int:
-    """Lanes of the kernels, see geometry.clh."""
-    if not build.is_cpu(device):
-        return 1
-    return 16 if device.native_vector_width_float >= 16 else 8
 
 
 def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:

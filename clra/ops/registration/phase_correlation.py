@@ -10,10 +10,17 @@ from pyopencl.array import Array
 
 from clra.ops.filtering.fft import RealFFT, fast_length
 from clra.ops.registration.windows import tukey
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch
-from clra.ops.runtime.kernel import Step, group, to_device
-from clra.ops.runtime.lines import lanes, lined
+from clra.ops.runtime.buffers import (
+    Allocator,
+    Scratch,
+    check_array,
+    check_images,
+    check_queue,
+    to_device,
+)
+from clra.ops.runtime.kernel import Step, group
+from clra.ops.runtime.lines import lined
+from clra.ops.runtime.profile import profile_of
 
 # Part of the mean modulus of a pair's cross-power below which a frequency fades out of the phase
 # correlation. Where motion has blurred a reconstruction, what a re-projection still has of high
@@ -74,7 +81,7 @@ class CorrelationPeak:
         self.simulated = memory.empty((views, rows, columns))
         self._spectra = [memory.empty(self._fft.spectrum_shape, np.complex64) for _ in range(2)]
         self._cross_power = Step(context, "phase_correlation.cl", "cross_power", (64,))
-        self._group = group(context, "phase_correlation.cl", "peak", 64)
+        self._group = group(context, "phase_correlation.cl", "peak", 256)
         shared = (self._group, 1), {"GROUP": self._group}
         self._whiten = Step(context, "phase_correlation.cl", "whiten", *shared) if whiten else None
         self._peak = Step(context, "phase_correlation.cl", "peak", *shared)
@@ -162,9 +169,10 @@ class CoarseShift:
         )
         half = weights[: rows // 2 * 2 : 2, : columns // 2 * 2 : 2]
         self._window = to_device(context, lined(half))
-        self._lanes = lanes(context)
+        profile = profile_of(context)
+        self._lanes = profile.image_lanes
         self._halve = Step(
-            context, "phase_correlation.cl", "halve", (32, 1, 1), {"LANES": self._lanes}
+            context, "phase_correlation.cl", "halve", profile.image_group, {"LANES": self._lanes}
         )
 
     def __call__(
@@ -254,7 +262,7 @@ class PhaseCorrelation:
         self._windows = [to_device(context, tukey(length, 0.35)) for length in shape]
         self._mean = [memory.empty((views,)) for _ in range(2)]
         self.scratch_bytes = memory.bytes
-        size = self._group = group(context, "phase_correlation.cl", "means", 64)
+        size = self._group = group(context, "phase_correlation.cl", "means", 256)
         self._means = Step(context, "phase_correlation.cl", "means", (size, 1), {"GROUP": size})
         self._windowed = Step(context, "phase_correlation.cl", "windowed", (32, 4, 1))
         self._last: list[cl.Event] = []
@@ -290,9 +298,9 @@ class PhaseCorrelation:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         n = check_pair(self._context, self._shape, measured, simulated)
-        build.check_array("shifts_out", shifts_out, (n, 2), context=self._context)
+        check_array("shifts_out", shifts_out, (n, 2), context=self._context)
         for start in range(0, n, self._views):
             part = slice(start, min(n, start + self._views))
             waits = [*(wait_for or ()), *self._last]
@@ -331,6 +339,6 @@ def check_pair(
     context: cl.Context, shape: tuple[int, int], measured: Array, simulated: Array
 ) -> int:
     """Return the number of pairs, after both arrays were found to be (n, rows, columns)."""
-    n = build.check_images("measured", measured, shape, context)
-    build.check_array("simulated", simulated, (n, *shape), context=context)
+    n = check_images("measured", measured, shape, context)
+    check_array("simulated", simulated, (n, *shape), context=context)
     return n

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clra.model.grid import VolumeGrid
 from clra.ops.runtime import build
-from clra.ops.runtime.devices import choose_device
+from clra.ops.runtime.devices import usable_device
 from clra.ops.streaming.memory import Budgets, DeviceMemory, DeviceMemoryError, HostRoom
 from clra.progress import Progress, ProgressCallback
 
@@ -30,7 +30,7 @@ class Stream:
     Parameters
     ----------
     device : str or cl.Device, optional
-        As :func:`clra.ops.runtime.devices.choose_device` takes it.
+        As :func:`clra.ops.runtime.devices.usable_device` takes it.
     max_device_memory, max_host_memory : int, optional
         Bytes; by default 3/4 of the device's memory and half of what the host has available. The
         host's counts what comes on top of the imported modules and built kernels.
@@ -49,7 +49,7 @@ class Stream:
     Raises
     ------
     DeviceError
-        If there is no such device.
+        If there is no such device, or it fails the self-test.
     InputError
         If a budget is not positive.
     """
@@ -62,7 +62,7 @@ class Stream:
         max_host_memory: int | None = None,
         report: ProgressCallback | None = None,
     ) -> None:
-        self.device = choose_device(device)
+        self.device = usable_device(device, report)
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
         self._builds = build.builds(self.context)  # held: operators come and go

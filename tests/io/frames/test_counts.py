@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 
 from clra.errors import InputError
-from clra.io.frames.counts import Radiographs
+from clra.io.frames.counts import CountedRadiographs
 
 NONE = np.array([], np.intp)
 
 
-def radiographs(frames: np.ndarray, **changes: object) -> Radiographs:
+def radiographs(frames: np.ndarray, **changes: object) -> CountedRadiographs:
     """Frame 0 dark, 1 flat, the others radiographs."""
     roles = {"views": np.arange(2, len(frames)), "flats": np.array([1]), "darks": np.array([0])}
-    return Radiographs(frames, path="scan.nxs", **{**roles, **changes})
+    return CountedRadiographs(frames, path="scan.nxs", **{**roles, **changes})
 
 
 def frames(count: int = 3, shape: tuple[int, int] = (11, 13)) -> np.ndarray:
@@ -25,7 +25,7 @@ def test_flats_run_from_group_to_group() -> None:
     for frame, level in flat.items():
         counts[frame] = level
     views = np.array([2, 3, 5, 6, 7])
-    found = Radiographs(
+    found = CountedRadiographs(
         counts, path="scan.nxs", views=views, flats=np.array(list(flat)), darks=NONE
     )
     # Groups stand at frames 0.5, 4 and 8.
@@ -37,7 +37,7 @@ def test_flats_run_from_group_to_group() -> None:
 def test_outside_the_groups_the_nearest_flat_holds() -> None:
     counts = np.ones((5, 3, 5))
     counts[1], counts[3] = 10.0, 20.0
-    found = Radiographs(
+    found = CountedRadiographs(
         counts, path="scan.nxs", views=np.array([0, 4]), flats=np.array([1, 3]), darks=NONE
     )
     np.testing.assert_allclose(found[:][:, 0, 0], [0.1, 0.05], rtol=1e-6)
@@ -115,7 +115,7 @@ def test_declared_saturation_and_saturated_flats() -> None:
 
 def test_normalised_frames_pass_unchanged() -> None:
     pixels = np.random.default_rng(0).random((4, 3, 5)).astype(np.float32)
-    found = Radiographs(
+    found = CountedRadiographs(
         pixels, path="scan.nxs", views=np.arange(4), flats=NONE, darks=NONE, normalised=True
     )
     np.testing.assert_array_equal(found[1:3], pixels[1:3])

@@ -18,9 +18,9 @@ import numpy as np
 import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
 from clra.methods.execution import several_devices
-from clra.ops.runtime.devices import choose_devices
+from clra.ops.runtime.devices import usable_devices
 
-devices = choose_devices("all")
+devices = usable_devices("all")
 if len(devices) < 2:
     print("one device")
     sys.exit()

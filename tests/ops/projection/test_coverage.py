@@ -8,9 +8,9 @@ import pyopencl.array
 import pytest
 
 import clra
-from clra.model.field_of_view import field_radii
 from clra.model.grid import VolumeGrid
-from clra.model.redundancy import ray_weights
+from clra.model.sampling.field_of_view import field_radii
+from clra.model.sampling.ray_weights import ray_weights
 from clra.ops.filtering.ramp import taper
 from clra.ops.projection.coverage import Coverage
 

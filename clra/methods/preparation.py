@@ -1,0 +1,107 @@
+"""Defects of a scan are found, and corrected from then on, before anything else is done with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.findings import Finding
+from clra.model.corrections.corrections import Corrections
+from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
+from clra.model.corrections.options import CorrectionOptions
+from clra.model.scan import Scan
+from clra.progress import ProgressCallback, tell
+
+# Views that the detector's pixels are judged by: 60 tell a hot pixel from photon noise, and of
+# large detectors fewer, so many that about this number of pixels is read.
+_VIEWS, _FEWEST_VIEWS, _PIXELS = 60, 16, 60e6
+# Parts of the detector whose pixels cannot all be bad: then the statistics mean something else.
+_MOST = 0.2
+
+
+def prepared(
+    scan: Scan,
+    options: CorrectionOptions | None = None,
+    *,
+    progress: ProgressCallback | None = None,
+) -> Scan:
+    """Return a scan with corrections for the defects that its radiographs have.
+
+    What is found is issued as findings (:meth:`clra.findings.Finding.warn`).
+
+    Parameters
+    ----------
+    scan : Scan
+        At most 60 of its radiographs are read, one after another. A scan that has its corrections
+        already is returned as it is.
+    options : CorrectionOptions, optional
+        What to look for; by default the defaults of these.
+    progress : callable, optional
+        Called with a :class:`clra.progress.Progress` as work goes on.
+
+    Returns
+    -------
+    Scan
+        The corrections are made as it is read.
+    """
+    options = options or CorrectionOptions()
+    if scan.corrections is not None:
+        return scan
+    corrections = Corrections(zingers=options.zingers)
+    if options.bad_pixels and scan.views >= FEWEST:
+        statistics = DetectorStatistics(scan.geometry.shape)
+        views = sample_of_views(scan)
+        for done, view in enumerate(views):
+            tell(progress, "looking for bad pixels", done, len(views))
+            statistics.add(scan.read(view, view + 1)[0])
+        found = statistics.find()
+        tell(progress, "looking for bad pixels", len(views), len(views))
+        for finding in bad_pixel_findings(found):
+            finding.warn()
+        if found.bad.any() and found.bad.mean() <= _MOST:
+            corrections = replace(corrections, bad=found.bad)
+    return replace(scan, corrections=corrections)
+
+
+def with_detector_of(scan: Scan, other: Scan) -> Scan:
+    """Return another scan by the same detector with the scan's mask, bad pixels and rings."""
+    return replace(other, mask=scan.mask, corrections=scan.corrections)
+
+
+def sample_of_views(scan: Scan) -> NDArray[np.intp]:
+    """Return the views by which the detector is judged, spread evenly over the scan."""
+    rows, columns = scan.geometry.shape
+    count = min(_VIEWS, max(_FEWEST_VIEWS, int(_PIXELS / (rows * columns))), scan.views)
+    return np.unique(np.linspace(0, scan.views - 1, count).round().astype(np.intp))
+
+
+def bad_pixel_findings(found: BadPixels) -> list[Finding]:
+    """Return what to tell users of bad pixels, if there are any."""
+    if not found.bad.any():
+        return []
+    measured: dict[str, float | str] = {
+        "bad_pixels": int(found.bad.sum()),
+        "single": found.single,
+        "rows": " ".join(map(str, found.rows)),
+        "columns": " ".join(map(str, found.columns)),
+    }
+    if found.bad.mean() > _MOST:
+        return [
+            Finding(
+                "bad-pixels",
+                f"{found.bad.mean():.0%} of the pixels seem to show nothing of the sample",
+                "none of them is corrected: check that the radiographs are of one sample that "
+                "turns, or give a mask",
+                measured=measured,
+            )
+        ]
+    return [
+        Finding(
+            "bad-pixels",
+            f"{found}: interpolated from their neighbours",
+            severity="info",
+            measured=measured,
+        )
+    ]
