@@ -1,4 +1,4 @@
-"""Filtered back-projection that is non-negative and fits its radiographs better than a plain one."""
+"""Filtered back-projection that is non-negative and fits its radiographs better."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from clra.ops.streaming.volume import Volume
 VOLUMES = 2
 # Of the corrections. Where views are few for the width of the sample, B A is more than 1 for fine
 # detail, and beyond 2 the series diverges: 77 views of 256 pixels at a distance of 2 degrees ended
-# at 0.13 pixel in v with a full ramp, 0.02 with this; scans of the paper's at 0.013 instead of 0.008.
+# at 0.13 pixel in v with a full ramp, 0.02 with this; the paper's scans at 0.013 instead of 0.008.
 _WINDOW = "hann"
 
 
@@ -137,7 +137,7 @@ def reprojections(
         project(projected, views)
         if measured is not None and subtract is not None:
             there = stream.upload(measured.read(views))
-            still = np.tile(np.float32([0, 0, 1]), (len(projected), 1))
+            still = np.tile(np.array([0, 0, 1], np.float32), (len(projected), 1))
             subtract(stream.queue, projected, there, projected, stream.upload(still))
         kept.write(views.start, stream.download(projected))
     stream.report(stage, geometry.views, geometry.views)

@@ -8,8 +8,8 @@ import pytest
 
 import clra
 from clra.methods.alignment.level import Level
-from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.methods.alignment.options import Solver
+from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.phantoms.ellipsoids import Ellipsoids

@@ -122,10 +122,15 @@ def test_artefacts_of_the_reconstruction_displace_less_without_their_bias(geomet
 
 def test_only_small_images_of_whole_turns_are_biased(geometry):
     half = clra.circular(
-        20, arc=math.pi, source_to_axis=50.0, source_to_detector=100.0, pixel_size=0.1, shape=(60, 60)
+        20,
+        arc=math.pi,
+        source_to_axis=50.0,
+        source_to_detector=100.0,
+        pixel_size=0.1,
+        shape=(60, 60),
     )
     assert Solver().is_biased(geometry) and not Solver(unbias=False).is_biased(geometry)
-    assert not Solver().is_biased(replace(geometry, shape=(464, 256)))
+    assert not Solver().is_biased(dataclasses.replace(geometry, shape=(464, 256)))
     assert not Solver().is_biased(half)
 
 
