@@ -200,6 +200,7 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "device": result.device,
         "seconds": seconds,
         "history": result.history,
+        "quality": None if result.quality is None else result.quality.as_dict(),
         **(errors.means() if errors else {}),
     }
     lines = {
