@@ -101,7 +101,7 @@ class Scan:
             mask.flags.writeable = False
             object.__setattr__(self, "mask", mask)
         if self.corrections is not None:
-            self.corrections.check(self.shape, self.name)
+            self.corrections.check(self.geometry.shape, self.name)
 
     @property
     def views(self) -> int:
@@ -149,7 +149,7 @@ class Scan:
             self._warn_of_dark(pixels)
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
         if self._all_corrections is not None:
-            pixels = self._all_corrections.apply(pixels, start)
+            pixels = self._all_corrections.apply(pixels)
         # One such pixel would spread over the whole volume through filter and back-projection.
         finite = np.isfinite(pixels).all(axis=(1, 2))
         if not finite.all():
@@ -264,7 +264,7 @@ class Scan:
             name=self.name,
             truth=None if self.truth is None else self.truth.subset(index),
             mask=self.mask,
-            corrections=None if self.corrections is None else self.corrections.subset(chosen),
+            corrections=self.corrections,
         )
 
 

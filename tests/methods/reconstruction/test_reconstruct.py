@@ -9,7 +9,7 @@ import pytest
 import clra
 from clra.errors import InputError
 from clra.methods.alignment.result import AlignmentResult
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
 
