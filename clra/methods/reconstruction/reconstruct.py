@@ -29,7 +29,7 @@ from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
-from clra.model.validation import believed_views
+from clra.model.validation import checked_valid_views
 from clra.ops.runtime.devices import usable_devices
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -205,7 +205,7 @@ def reconstruct_into(
         motion = alignment.motion
         valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
-        valid_views = believed_views(valid_views, scan.views)
+        valid_views = checked_valid_views(valid_views, scan.views)
     options = iterative.checked_options(method, options)
     keeping, own = checkpoint_of(checkpoint, resume)
     if keeping is not None and keeping.resume and options is None and not align:
