@@ -69,6 +69,11 @@ class Finding:
         return self
 
 
+def warn(code: str, message: str, advice: str = "") -> None:
+    """Issue a finding of severity "warning"; see :class:`Finding`."""
+    Finding(code, message, advice).warn()
+
+
 @contextmanager
 def collected() -> Iterator[list[Finding]]:
     """Yield a list to which every finding that is issued within the block is appended, once."""

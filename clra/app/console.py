@@ -18,7 +18,9 @@ import typer
 from clra.app import progress_bar
 
 if TYPE_CHECKING:
+    from clra.io.scanners.scanner_options import ScannerOptions
     from clra.io.scanners.scanner_scan import ScannerScan
+    from clra.model.motion import Motion
     from clra.model.scan import Scan
     from clra.progress import ProgressCallback
 
@@ -157,11 +159,21 @@ class Reading:
     def scanner(self, path: Path) -> "ScannerScan | None":
         """Read the metadata of a scanner; None of an NXtomo file."""
         from clra.io.scanners.recognise import read_scanner, recognise
+
+        return None if recognise(path) is None else read_scanner(path, self._options())
+
+    def start_motion(self, path: Path, views: int) -> "Motion | None":
+        """Read the motion that a scanner's software measured; None of other files."""
+        from clra.io.scanners.recognise import holds_start_motion, read_start_motion
+
+        if not holds_start_motion(path):
+            return None
+        return read_start_motion(path, views, self._options())
+
+    def _options(self) -> "ScannerOptions":
         from clra.io.scanners.scanner_options import ScannerOptions
 
-        if recognise(path) is None:
-            return None
-        options = ScannerOptions(
+        return ScannerOptions(
             rotation=self.rotation,
             source_distance=self.source_distance,
             parallel=self.parallel,
@@ -169,7 +181,6 @@ class Reading:
             flip=self.flip,
             centre_offset=self._axis(),
         )
-        return read_scanner(path, options)
 
     def _axis(self) -> tuple[float, ...] | None:
         from clra.app.arguments import axis_place

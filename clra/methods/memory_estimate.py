@@ -6,6 +6,7 @@ import numpy as np
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reprojection import band_of, with_margin
+from clra.methods.reconstruction.fitted_fbp import VOLUMES
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.projection.layout import view_shape
@@ -107,9 +108,12 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     """
     geometry = full.binned(level) if level > 1 else full
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
-    # On small detectors its re-projections are kept beside the radiographs.
-    count = int(level > 1) + int(Solver().is_biased(geometry.shape))
-    return _registering_need(budgets, full, geometry, grid, 1, [_bytes(geometry)] * count)
+    # What the radiographs have beyond the re-projections is kept beside them; on small detectors
+    # the re-projections are as well.
+    solver = Solver()
+    count = int(level > 1) + int(solver.terms > 0) + int(solver.is_biased(geometry))
+    kept = [_bytes(geometry)] * count
+    return _registering_need(budgets, full, geometry, grid, VOLUMES, kept)
 
 
 def multigrid_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid) -> Need:

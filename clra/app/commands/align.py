@@ -37,8 +37,9 @@ def align(
     start: Annotated[
         Path | None,
         typer.Option(
-            metavar="MOTION.h5",
-            help="Motion to start from, of a run that was interrupted or shall be refined.",
+            metavar="MOTION",
+            help="Motion to start from: MOTION.h5 of a run that was interrupted or shall be "
+            "refined, or what a scanner's software measured (.txrm, .pcr, _TS.csv, CTSimU .json).",
         ),
     ] = None,
     autofocus: Annotated[
@@ -132,7 +133,8 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = None if start is None else read_alignment(start)
+    measured = None if start is None else reading.start_motion(start, opened.views)
+    earlier = None if start is None or measured is not None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
     about = {
@@ -159,7 +161,7 @@ def align(
                 estimate=estimate,
                 gauge=gauge,
                 reference=still,
-                motion=None if earlier is None else earlier.motion,
+                motion=measured if earlier is None else earlier.motion,
                 device=console.device,
                 progress=progress,
                 checkpoint=checkpoint,

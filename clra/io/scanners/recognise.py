@@ -202,6 +202,13 @@ def _is_hdf5(path: Path) -> bool:
         return True  # whoever opens it tells why it cannot be read
 
 
+def holds_start_motion(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a path is a scanner's, so that `read_start_motion` may find something there."""
+    place = Path(path)
+    alone = place.suffix.lower() == ".pcr" or place.name.lower().endswith("_ts.csv")
+    return (alone and place.is_file()) or recognise_or_none(place) is not None
+
+
 def recognise_or_none(path: Path) -> tuple[Format, Path] | None:
     """Return what `recognise` does, and None where it raises."""
     try:

@@ -129,7 +129,11 @@ def tiff_volume(
     except Exception as error:  # tifffile fails in many ways on what is no TIFF
         raise InputError(f"{os.fspath(path)}: cannot be read as TIFF: {error}") from error
     told = _CENTRE.search(note)
-    centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
+    try:
+        centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
+    except ValueError:
+        assert told is not None
+        raise InputError.at(path, "centre", repr(told[0]), "three numbers") from None
     return voxels, sizes[-1], centre
 
 

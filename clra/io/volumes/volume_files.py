@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 import clra
 from clra.errors import InputError, OutputError
 from clra.io.atomic import atomic_path
+from clra.io.damage import reads
 from clra.io.hdf5 import open_hdf5, require, text
 from clra.io.provenance import Provenance
 from clra.io.units import TO_MM, factor
@@ -122,6 +123,7 @@ def write_volume(
             tell(progress, "writing", stop, planes)
 
 
+@reads
 def read_volume(
     path: str | os.PathLike[str], start: int = 0, stop: int | None = None
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
@@ -180,16 +182,28 @@ def _read_hdf5(
         dataset = require(file, "volume", "a volume as clra writes it")
         if dataset.ndim != 3:
             raise InputError.at(path, "/volume", f"{dataset.ndim} axes", "z, y, x")
-        size = dataset.attrs.get("voxel_size")
-        if size is None:
-            raise InputError.at(path, "/volume@voxel_size", "nothing", "the size of a voxel")
+        size = _numbers(dataset, "voxel_size", ())
         scale = factor(text(dataset.attrs.get("voxel_size_units", "mm")), TO_MM)
         if scale is None:
             raise InputError.at(path, "/volume@voxel_size_units", "an unknown unit", "mm")
-        centre = np.asarray(dataset.attrs.get("centre", (0, 0, 0)), np.float64) * scale
-        grid = _grid(path, dataset.shape, float(size) * scale, tuple(centre.ravel()))
+        centre = _numbers(dataset, "centre", (0.0, 0.0, 0.0))
+        grid = _grid(path, dataset.shape, size[0] * scale, tuple(value * scale for value in centre))
         first, last, _ = planes.indices(grid.shape[0])
         return np.asarray(dataset[first:last], np.float32), grid.slab(first, last)
+
+
+def _numbers(dataset: h5py.Dataset, name: str, default: tuple[float, ...]) -> list[float]:
+    """Read an attribute of one or more numbers."""
+    value = dataset.attrs.get(name, default)
+    try:
+        numbers = [float(v) for v in np.asarray(value, np.float64).ravel()]
+    except (TypeError, ValueError):
+        numbers = []
+    if not numbers:
+        where = f"{dataset.name}@{name}"
+        found = "nothing" if value is default else repr(value)
+        raise InputError.at(dataset.file.filename, where, found, "numbers")
+    return numbers
 
 
 def _grid(

@@ -15,7 +15,7 @@ from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan

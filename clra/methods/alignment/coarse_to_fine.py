@@ -164,7 +164,7 @@ class CoarseToFine:
             # A first step finds too little, see `_move`: the second may well find as much.
             previous = None if self.fresh else update_size(update_u, update_v)[0]
         if len({entry.level for entry in self.history}) == 1:
-            note = warned(lost_features(self.scan, found.correlation, stage.level))
+            note = warned(lost_features=lost_features(self.scan, found.correlation, stage.level))
             notes = filter(None, (self.history[-1].note, note))
             self.history[-1] = replace(self.history[-1], note="\n".join(notes))
 
@@ -194,10 +194,10 @@ class CoarseToFine:
         step = self.steps.step(self.motion, there)
         valid_views = np.abs(step[:, ~self.rejected])
         if self.history:
-            note = warned(false_shifts(*self.last, level, valid_views))
+            note = warned(false_shifts=false_shifts(*self.last, level, valid_views))
             self.fresh = bool(note)
         else:
-            note = warned(far_motion(found.motion, level))
+            note = warned(out_of_reach=far_motion(found.motion, level))
             self.fresh = True
         self.last = level, valid_views
         # A first step's reconstruction was blurred, and what it registered is not all that later

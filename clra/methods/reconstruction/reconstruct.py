@@ -22,12 +22,12 @@ from clra.methods.reconstruction.iterative import Options
 from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevich
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
-from clra.model.angular_coverage import part_of_a_turn
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
+from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
 from clra.model.validation import believed_views
 from clra.ops.runtime.devices import usable_devices
@@ -211,11 +211,11 @@ def reconstruct_into(
     if keeping is not None and keeping.resume and options is None and not align:
         raise InputError(f"resume: found it with {method} alone, which keeps nothing on its way")
     with collected() as findings:
+        devices = usable_devices(device, progress)
         scan = prepared(scan, corrections, progress=progress)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
         grid = grid or default_grid(scan.geometry)
-        devices = usable_devices(device, progress)
         limits: dict[str, Any] = {
             "max_device_memory": max_device_memory,
             "max_host_memory": max_host_memory,
@@ -295,7 +295,7 @@ def _warn_of_scan(stream: Stream, scan: Scan, method: str) -> None:
         notes["short-scan"] = part_of_a_turn(scan.geometry)
         notes["cone-angle"] = steep_rows(scan.geometry)
     if method != "katsevich":  # that refuses such samples
-        notes["truncation"] = truncated(Radiographs(stream, scan, 1))
+        notes["truncation"] = truncated(Radiographs(stream, scan, 1), scan.geometry)
     for code, note in notes.items():
         if note:
             Finding(code, note).warn()

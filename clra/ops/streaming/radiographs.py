@@ -28,7 +28,15 @@ class Radiographs:
         At full resolution.
     level : int
         Binning factor: 1, 2, 4 or 8.
+
+    Attributes
+    ----------
+    extension : float or None
+        How far the sample reaches beyond the detector; None until it is looked at, see
+        :func:`clra.methods.truncation.extension`.
     """
+
+    extension: float | None = None
 
     def __init__(self, stream: Stream, scan: Scan, level: int) -> None:
         self.shape = (scan.views, *scan.geometry.binned(level).shape)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
 
