@@ -86,7 +86,7 @@ static inline void pairs(local float2 *line, const int item)
 }
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
-    global float *filtered, // (views, rows, columns), may be the projections
+    global float *filtered, // (views, rows, wider), may be the projections if that is no wider
     const ulong filtered_offset,
     global const float *projections, // (views, rows, columns), line integrals
     const ulong projections_offset,
@@ -94,6 +94,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     const ulong view_table_offset, // of the projections' first view
     global const float *restrict row_weight, // (rows,)
     const ulong row_weight_offset,
+    global const float *restrict ray_weight, // (views, columns) of the projections, or (columns,)
+    const ulong ray_weight_offset,
     global const float *restrict roll, // (LENGTH - columns,): what columns past the detector keep
     const ulong roll_offset,
     global const float *restrict ramp, // (LENGTH,): spectrum / LENGTH, in the transform's order
@@ -101,7 +103,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     global const float2 *restrict twiddles, // (LENGTH,): exp(-2 pi i k / LENGTH)
     const ulong twiddles_offset,
     const int rows, // of a view
-    const int columns)
+    const int columns,
+    const int ray_stride, // columns, or 0 if all views have the same ray weights
+    const int wider, // columns of `filtered`
+    const int before) // of these, left of the detector, at the line's end
 {
     local float2 line[PLACE(LENGTH)];
     filtered += filtered_offset;
@@ -112,7 +117,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     ramp += ramp_offset;
     twiddles += twiddles_offset;
     const int item = get_local_id(0), pairs_of_view = (rows + 1) / 2;
-    const int top = (int)get_group_id(0) / pairs_of_view * rows; // of the view
+    const int view = (int)get_group_id(0) / pairs_of_view, top = view * rows;
+    ray_weight += ray_weight_offset + (ulong)view * ray_stride;
     const int first = top + 2 * ((int)get_group_id(0) % pairs_of_view), second = first + 1;
     const int both = second < top + rows;
     const int other = both ? second : first; // the last row of an odd number is taken twice
@@ -122,9 +128,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     global const float *q = projections + (ulong)other * columns;
     for (int i = item; i < LENGTH; i += GROUP) {
         const int from = source_column(i, columns, LENGTH);
-        const float part = i < columns ? 1.0f : roll[i - columns];
+        const float part = ray_weight[from] * (i < columns ? 1.0f : roll[i - columns]);
         float2 value = 0.0f;
-        if (part > 0.0f)
+        if (part != 0.0f)
             value = part * (float2)(p[from] * weight_at(one, from), q[from] * weight_at(two, from));
         line[PLACE(i)] = value;
     }
@@ -147,10 +153,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
 #endif
     for (; quarter <= LENGTH / 4; quarter *= 4)
         unstage(line, twiddles, item, quarter);
-    for (int i = item; i < columns; i += GROUP) {
-        const float2 value = line[PLACE(i)];
-        filtered[(ulong)first * columns + i] = value.x;
+    for (int i = item; i < wider; i += GROUP) {
+        const int from = i < before ? i - before + LENGTH : i - before;
+        const float2 value = line[PLACE(from)];
+        filtered[(ulong)first * wider + i] = value.x;
         if (both)
-            filtered[(ulong)second * columns + i] = value.y;
+            filtered[(ulong)second * wider + i] = value.y;
     }
 }

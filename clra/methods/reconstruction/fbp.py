@@ -139,7 +139,7 @@ def ramp_fbp(
             for chunk in stream.chunks(run.stop - run.start, filtered_bytes):
                 views = slice(run.start + chunk.start, run.start + chunk.stop)
                 stream.report(stage, done, total)
-                measured = stream.upload(radiographs.read(views))
+                measured = radiographs.on_device(stream, views)
                 filtered = stream.empty((len(measured), *ramp.geometry.shape))
                 ready = ramp(queue, filtered, measured, views=views)
                 event = back(

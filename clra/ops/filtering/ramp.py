@@ -146,9 +146,7 @@ class RampFilter:
         margin = math.ceil(extend * self._columns)
         self._wider = (0, 0) if ray_weights is None else ray_weights.beyond
         least = 2 * (self._columns + margin + max(self._wider))
-        # The one-kernel form knows no weights of single rays.
-        alone = backend is None and ray_weights is None
-        length = transform_length(context, least) if alone else None
+        length = transform_length(context, least) if backend is None else None
         self.padded = length or fast_length(context, least, backend)
         self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
         self._view_weight = view_weights(view_weight, self._views)
@@ -245,15 +243,17 @@ class RampFilter:
         total = shape[0] * self._rows
         events = [*(wait_for or ()), *self._last]
         sizes = (self._columns, self.padded)
-        if self._transform is not None:
-            tables = self._view_table[start:], self._row_weight, self._roll
-            event = self._transform(queue, filtered_out, projections, tables, events)
-            self._last = [event]
-            return event
         rays, stride = self._alike, 0
         if self._ray_weights is not None:
             table = self._ray_weights.at(np.arange(self._columns), slice(start, stop))
             rays, stride = to_device(self._context, table), self._columns
+        if self._transform is not None:
+            tables = self._view_table[start:], self._row_weight, rays, self._roll
+            event = self._transform(
+                queue, filtered_out, projections, tables, stride, self._wider[0], events
+            )
+            self._last = [event]
+            return event
         for first in range(0, total, len(self._lines)):
             count = min(len(self._lines), total - first)
             part = self._lines[:count]

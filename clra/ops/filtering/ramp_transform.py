@@ -53,9 +53,11 @@ class RampTransform:
         filtered: Array,
         projections: Array,
         tables: Sequence[Array],
+        ray_stride: int,
+        before: int,
         wait_for: Sequence[cl.Event],
     ) -> cl.Event:
-        """Filter all rows; `tables` are the views', the rows' weights and the roll."""
+        """Filter all rows; `tables` are the views', the weights of rows and rays, and the roll."""
         views, rows, columns = projections.shape
         return self._step(
             queue,
@@ -67,6 +69,9 @@ class RampTransform:
             self._twiddles,
             rows,
             columns,
+            ray_stride,
+            filtered.shape[2],
+            before,
             wait_for=wait_for,
         )
 

@@ -113,7 +113,8 @@ def test_windows_shape_the_ramp(context, queue, window):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_filtered_radiographs_of_an_offset_detector_are_wider(context, queue, side):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_filtered_radiographs_of_an_offset_detector_are_wider(context, queue, side, form):
     """As if the rays past its near side had been measured as 0."""
     distances = {"source_to_axis": 20.0, "source_to_detector": 60.0, "pixel_size": 1.5}
     centred = circular(40, shape=(3, 37), **distances)
