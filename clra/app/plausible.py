@@ -10,7 +10,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 
 if TYPE_CHECKING:
-    from clra.methods.alignment.quality import Quality
+    from clra.methods.alignment.agreement import Agreement
 
 # Transmission that no sample causes, and the part of the pixels in which it may be all the same:
 # the rims of phase contrast are as bright, flats that fit badly are not.
@@ -73,12 +73,12 @@ def doubt_of_turning(sharpening: float) -> str:
     )
 
 
-def doubt_of_shifts(quality: "Quality", motion: Motion) -> str:
+def doubt_of_shifts(quality: "Agreement", motion: Motion) -> str:
     """Return a warning if half scans disagree on the shifts by more than there is of them.
 
     Parameters
     ----------
-    quality : Quality
+    quality : Agreement
         Of the alignment.
     motion : Motion
         That it found.

@@ -4,10 +4,11 @@ import os
 from dataclasses import replace
 from typing import Any
 
-from clra.errors import InputError
+from clra.errors import Cancelled, InputError
 from clra.findings import collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.quality import Quality, assess
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
@@ -21,12 +22,15 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
 from clra.ops.runtime.versions import versions
+from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
 METHODS = ("ra", "imgr", "reference")
 ESTIMATES = ("shift", "shift+scale", "source")
 GAUGES = ("anchored", "free")
+# Valid views below which none can be held out.
+_ENOUGH_TO_JUDGE = 4
 
 
 def align(
@@ -48,6 +52,7 @@ def align(
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
     corrections: CorrectionOptions | None = None,
+    quality: bool = True,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -97,6 +102,9 @@ def align(
         Bytes that may be used.
     corrections : CorrectionOptions, optional
         Defects of the radiographs to look for and correct first; by default the defaults of these.
+    quality : bool
+        Whether to judge the result by views that are held out: a verdict, and standard errors that
+        count what is left. A motion that predicts them no better than the start is not returned.
 
     Returns
     -------
@@ -209,10 +217,27 @@ def align(
                 aligned = run.result()
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
+        if quality and not cancelled(findings):
+            aligned = _judged(stream, part, aligned, start, scale)
+            findings += aligned.quality.reasons if isinstance(aligned.quality, Quality) else ()
         result = told(aligned)
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()
     return result
+
+
+def _judged(
+    stream: Stream, scan: Scan, aligned: AlignmentResult, start: Motion, scale: bool
+) -> AlignmentResult:
+    """Add a verdict, unless the call is ended or there is not enough to judge by."""
+    if aligned.valid_views.sum() < _ENOUGH_TO_JUDGE:
+        return aligned
+    try:
+        return assess(stream, scan, aligned, start, scale=scale)
+    except (Cancelled, DeviceMemoryError):
+        return aligned  # which is finished
+    except KeyboardInterrupt:
+        raise AlignmentInterrupted(aligned) from None
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:
