@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 
-from clra.app.plausible import doubt_of_shifts, doubt_of_turning
+from clra.app.plausible import doubt_of_shifts
 from clra.methods.alignment.agreement import Agreement
 from clra.model.motion import Motion
-
-
-@pytest.mark.parametrize(
-    ("sharpening", "doubted"), [(1.3, True), (1.0, False), (0.7, False), (float("nan"), False)]
-)
-def test_the_sense_of_turning_is_doubted_where_the_other_is_sharper(sharpening, doubted):
-    told = doubt_of_turning(sharpening)
-    assert bool(told) == doubted
-    assert not doubted or ("1.30" in told and "--rotation" in told)
 
 
 @pytest.mark.parametrize(

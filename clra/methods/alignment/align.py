@@ -5,15 +5,17 @@ from dataclasses import replace
 from typing import Any
 
 from clra.errors import Cancelled, InputError
-from clra.findings import collected
+from clra.findings import Finding, collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.quality import Quality, assess
+from clra.methods.alignment.quality import assess
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
 from clra.methods.preparation import prepared, with_detector_of
+from clra.methods.radiograph_checks import refuse_counts
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.model.corrections.options import CorrectionOptions
@@ -161,6 +163,7 @@ def align(
         )
 
     scale = estimate != "shift"
+    refuse_counts(scan)
     with collected() as findings:
         scan = prepared(scan, corrections, progress=progress)
         # What the mask leaves of the detector is aligned as a detector of its own.
@@ -218,8 +221,8 @@ def align(
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
-            aligned = _judged(stream, part, aligned, start, scale)
-            findings += aligned.quality.reasons if isinstance(aligned.quality, Quality) else ()
+            aligned, told_of = _judged(stream, part, aligned, start, scale)
+            findings += told_of
         result = told(aligned)
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()
@@ -228,14 +231,14 @@ def align(
 
 def _judged(
     stream: Stream, scan: Scan, aligned: AlignmentResult, start: Motion, scale: bool
-) -> AlignmentResult:
-    """Add a verdict, unless the call is ended or there is not enough to judge by."""
-    if aligned.valid_views.sum() < _ENOUGH_TO_JUDGE:
-        return aligned
+) -> tuple[AlignmentResult, list[Finding]]:
+    """Add a verdict and findings, unless the call is ended or there is not enough to judge by."""
     try:
-        return assess(stream, scan, aligned, start, scale=scale)
+        if aligned.valid_views.sum() >= _ENOUGH_TO_JUDGE:
+            aligned = assess(stream, scan, aligned, start, scale=scale)
+        return evidence(stream, scan, aligned)
     except (Cancelled, DeviceMemoryError):
-        return aligned  # which is finished
+        return aligned, []  # which is finished
     except KeyboardInterrupt:
         raise AlignmentInterrupted(aligned) from None
 

@@ -1,8 +1,8 @@
 """Held-out views: how well a volume from some of the views predicts the others.
 
-A volume can be made to agree with radiographs that lie wrong, as long as it is made from them. Views
-that it was not made from are predicted well only if all lie where they belong. The volume is not
-negative and found by iteration: ramp-filtered back-projection is a poor inverse where rays are
+A volume can be made to agree with radiographs that lie wrong, as long as it is made from them.
+Views that it was not made from are predicted well only if all lie where they belong. The volume is
+not negative and found by iteration: ramp-filtered back-projection is a poor inverse where rays are
 missing, and its artefacts would hide the difference.
 """
 
@@ -88,7 +88,8 @@ class HeldOut:
         valid = np.flatnonzero(valid_views)
         if len(valid) <= _VIEWS:
             return valid
-        return valid[np.unique(np.linspace(0, len(valid) - 1, _VIEWS).astype(int))]
+        spread = np.unique(np.linspace(0, len(valid) - 1, _VIEWS).astype(int))
+        return np.asarray(valid[spread])
 
     def radiographs(self, valid_views: NDArray[np.bool_]) -> tuple[Radiographs, NDArray[np.intp]]:
         """Read and bin what is needed; the second value are the views that these are."""

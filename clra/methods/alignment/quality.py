@@ -238,7 +238,7 @@ def _better(gauge: _Left, before: Predicted, after: Predicted) -> bool:
     gain = before.residual[both] ** 2 - after.residual[both] ** 2
     certain = gain.mean() > 2 * gain.std() / np.sqrt(max(1, both.sum() - 1))
     apart = [np.sqrt(np.nanmean(gauge.of(p)[both, :2] ** 2)) for p in (before, after)]
-    return bool(certain and gain.mean() > 0 or apart[1] < 0.9 * apart[0])
+    return bool((certain and gain.mean() > 0) or apart[1] < 0.9 * apart[0])
 
 
 def _moved(motion: Motion, start: Motion) -> bool:
