@@ -133,10 +133,8 @@ def volume_file(path: Path) -> None:
     InputError
         If there is no such format.
     """
-    from clra.io.volumes.volume_files import HDF5, TIFF
+    from clra.io.volumes.volume_files import SUFFIXES
 
-    expected = ", ".join((HDF5[0], *TIFF))
-    if path.suffix.lower() == ".zarr":
-        raise InputError(f"{path}: zarr volumes cannot be written yet, expected {expected}")
-    if path.suffix.lower() not in HDF5 + TIFF:
+    if path.suffix.lower() not in SUFFIXES:
+        expected = ", ".join(SUFFIXES)
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {expected}")
