@@ -65,12 +65,12 @@ def _clra(
 
 command(app, "devices")(devices)
 command(app, "info")(info)
-command(app, "import")(import_scan)
-command(app, "simulate")(simulate)
-command(app, "align")(align)
-command(app, "reconstruct")(reconstruct)
-command(app, "correct")(correct)
-command(app, "report")(report)
+command(app, "import", writes=True)(import_scan)
+command(app, "simulate", writes=True)(simulate)
+command(app, "align", writes=True)(align)
+command(app, "reconstruct", writes=True)(reconstruct)
+command(app, "correct", writes=True)(correct)
+command(app, "report", writes=True)(report)
 command(app, "demo")(demo)
 
 

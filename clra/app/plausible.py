@@ -1,11 +1,11 @@
 """What data tell against the way in which a scan is read, or against what alignment found."""
 
 import math
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from clra.findings import warn
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 
@@ -37,18 +37,18 @@ def warn_of_scale(scan: Scan) -> None:
     pixels = np.concatenate([np.ravel(scan.projections[k : k + 1]) for k in few])
     dark, bright = np.mean(pixels <= 0), np.mean(pixels > _BRIGHT)
     if dark > 0.5:
-        warnings.warn(
+        warn(
+            "intensity-scale",
             f"{scan.name}: {dark:.0%} of the pixels are not brighter than the darks: are flats and "
             "darks of these frames, or do the frames hold transmission or line integrals already "
             "(clra import --kind)?",
-            stacklevel=3,
         )
     elif bright > _RIMS:
-        warnings.warn(
+        warn(
+            "intensity-scale",
             f"{scan.name}: {bright:.0%} of the pixels are more than {_BRIGHT:g} times as bright as "
             "the open beam: are the flats of these frames, is the byte order right, or do they "
             "hold line integrals (clra import --kind)?",
-            stacklevel=3,
         )
 
 

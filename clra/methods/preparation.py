@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from clra.findings import Finding
 from clra.model.bad_pixels import Patches
 from clra.model.corrections.air_region import AirRegion, AirStatistics
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.corrections.corrections import Corrections
 from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
-from clra.model.corrections.options import CorrectionOptions
 from clra.model.corrections.rings import ring_errors
 from clra.model.scan import Scan
 from clra.progress import ProgressCallback, tell

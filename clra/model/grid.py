@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.model.sampling.field_of_view import field_radii
 from clra.model.validation import positive, whole
 
 if TYPE_CHECKING:
@@ -136,9 +137,10 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
 
     A voxel is a pixel seen at the axis, |u| SOD / SDD (median over the views). In x and y the grid
     covers the circle about the axis that every view sees: its radius is the distance from the axis
-    to the nearer of the planes through the source and a side of the detector, SOD sin(half fan). In
-    z it covers the heights at which the axis is seen by at least half as many views as where it is
-    seen best.
+    to the nearer of the planes through the source and a side of the detector, SOD sin(half fan); to
+    the farther one if :func:`clra.model.sampling.field_of_view.is_offset`. In z it covers the
+    heights at which the axis is seen by at least half as many views as where it is seen best; of a
+    parallel beam without the planes of the outermost rows.
 
     Parameters
     ----------
@@ -168,34 +170,14 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     low, high = _axis_range(geometry)
     across = max(1, math.ceil(2 * radius / voxel - _SLACK))
     planes = max(1, math.ceil((high - low) / voxel - _SLACK))
+    if np.allclose(magnified, 1.0, rtol=1e-9):
+        # Of a far source that stands for a parallel beam, the outermost rows are seen at half of
+        # their planes only, where these lie before the axis.
+        planes = max(1, planes - 2)
     middle = 0.5 * (low + high)
     # A scan about z = 0 gets a grid about z = 0, not about what rounding left.
     z = middle if abs(middle) > _SLACK * voxel else 0.0
     return VolumeGrid(shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, z))
-
-
-def field_radii(geometry: ConeBeamGeometry) -> Floats:
-    """Radius of the circle about the axis that each view sees, at the source's height.
-
-    Parameters
-    ----------
-    geometry : ConeBeamGeometry
-        Of the scan.
-
-    Returns
-    -------
-    ndarray, (views,)
-        [mm]; negative for a view that does not see the axis.
-    """
-    nearest = np.full(geometry.views, np.inf)
-    for side in (-1, 1):
-        edge = geometry.detector + side * geometry.columns / 2 * geometry.u - geometry.source
-        normal = np.cross(edge, geometry.v)
-        inward = np.sign(np.sum(normal * -side * geometry.u, axis=1))
-        horizontal = np.linalg.norm(normal[:, :2], axis=1)
-        distance = -np.sum(normal[:, :2] * geometry.source[:, :2], axis=1) * inward / horizontal
-        nearest = np.minimum(nearest, distance)
-    return nearest
 
 
 def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:

@@ -86,10 +86,12 @@ def test_default_grid_of_a_circle():
     assert grid.centre == (0, 0, 0)
 
 
-def test_default_grid_takes_the_nearer_side_of_an_offset_detector():
-    geometry = circular(8, **CIRCLE)
-    shifted = geometry.with_motion(Motion(shift_u=np.full(8, 7.0), shift_v=np.zeros(8)))
-    half_fan = np.arctan((41 / 2 - 7) * 0.5 / 100)
+@pytest.mark.parametrize(("arc", "shift", "edge"), [(1, 1.5, -1), (0.7, 7, -1), (1, 7, 1)])
+def test_default_grid_takes_the_farther_side_of_an_offset_detector_only(arc, shift, edge):
+    geometry = circular(80, arc=arc * 2 * np.pi, **CIRCLE)
+    moved = Motion(shift_u=np.full(80, float(shift)), shift_v=np.zeros(80))
+    shifted = geometry.with_motion(moved)
+    half_fan = np.arctan((41 / 2 + edge * shift) * 0.5 / 100)
     assert default_grid(shifted).shape[2] == np.ceil(2 * 40 * np.sin(half_fan) / 0.2)
 
 

@@ -10,14 +10,7 @@ from clra.app.console import Console, Memory, Reading
 from clra.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from clra.methods.reconstruction.imgr_state import ImgrStep
     from clra.model.grid import VolumeGrid
-    from clra.model.motion import Motion
-    from clra.model.scan import Scan
-    from clra.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -53,7 +46,7 @@ class Iterating:
         typer.Option(metavar="QR-HR-FR", help="imgr: resolutions of a cycle; ER is an eighth."),
     ] = None
     resume: Annotated[
-        bool, typer.Option("--resume", help="imgr: go on where Ctrl-C stopped this command.")
+        bool, typer.Option("--resume", help="Go on where this command was interrupted.")
     ] = False
 
     def options(self) -> dict[str, Any]:
@@ -93,8 +86,8 @@ def reconstruct(
     """Reconstruct a volume.
 
     Covers the whole field of view, in 1/mm. The motion goes into the geometry: no radiograph is
-    resampled; with katsevich each is, once. Ctrl-C in imgr keeps the levels finished so far beside
-    the volume, and --resume goes on from there.
+    resampled; with katsevich each is, once. Whatever interrupts osem-tr, imgr or --align, finished
+    passes, levels and iterations stay beside the volume, and --resume goes on from there.
 
     Examples
     --------
@@ -104,11 +97,15 @@ def reconstruct(
       clra reconstruct scan.nxs -o volume.h5 --method imgr --align
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
     """
+    from clra.app.annotations import alignment_for
     from clra.app.arguments import volume_file
-    from clra.app.output_checks import alignment_for, room_for
+    from clra.app.exit_status import command_line, keeping
     from clra.app.scan_description import metric
+    from clra.io.atomic import ensure_writable
+    from clra.io.provenance import provenance
     from clra.io.volumes.volume_files import open_volume
-    from clra.methods.reconstruction.iterative import sorted_options
+    from clra.methods.execution.checkpoint import Checkpoint
+    from clra.methods.reconstruction.iterative import options_for
     from clra.methods.reconstruction.reconstruct import METHODS, reconstruct_into
     from clra.model.grid import default_grid
 
@@ -118,58 +115,52 @@ def reconstruct(
         raise InputError("--motion, --align: found both, expected one of them")
     if method not in METHODS:
         raise InputError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
-    if iterating.resume and method != "imgr":
-        raise InputError(f"--resume: found it with --method {method}, expected imgr")
-    options = iterating.options()
+    given = iterating.options()
     opened = reading.scan(scan)
     grid = default_grid(opened.cropped().geometry)
     initial = None
-    if options.get("initial") not in (None, "fbp", "uniform"):
-        initial = Path(options["initial"])
-        options["initial"] = _start(initial, grid)
-    sorted_options(method, options)
-    known = valid_views = None
+    if given.get("initial") not in (None, "fbp", "uniform"):
+        initial = Path(given["initial"])
+        given["initial"] = _start(initial, grid)
+    options = options_for(method, given)
+    if iterating.resume and options is None and not align:
+        expected = "osem-tr, imgr or --align"
+        raise InputError(f"--resume: found it with --method {method}, expected {expected}")
+    alignment = None
     if motion is not None:
         opened, alignment = alignment_for(opened, motion, reading.geometry())
-        known, valid_views = alignment.motion, alignment.valid_views
     nz, ny, nx = grid.shape
-    room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
-    steps: tuple[ImgrStep, ...] = ()
-    with console.progress() as progress:
-        if method == "imgr":
-            steps = _imgr(
+    ensure_writable(out, (scan, motion, initial), 4 * nz * ny * nx)
+    made = provenance(
+        command=command_line(),
+        scan=opened,
+        alignment=alignment,
+        method=method,
+        options=options,
+        grid=grid,
+    )
+    checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
+    with console.progress() as progress, keeping(checkpoint):
+        with open_volume(out, grid, provenance=made) as target:
+            done = reconstruct_into(
+                target,
                 opened,
-                out,
-                grid,
-                known,
-                valid_views,
-                align,
-                options,
-                iterating.resume,
-                console,
-                progress,
-                limits,
+                method=method,
+                grid=grid,
+                align=align,
+                device=console.device,
+                alignment=alignment,
+                options=options,
+                progress=progress,
+                checkpoint=checkpoint,
+                **limits,
             )
-        else:
-            with open_volume(out, grid) as target:
-                reconstruct_into(
-                    target,
-                    opened,
-                    method=method,
-                    grid=grid,
-                    motion=known,
-                    align=align,
-                    valid_views=valid_views,
-                    device=console.device,
-                    progress=progress,
-                    **limits,
-                    **options,
-                )
+        checkpoint.clear()
     values = {"file": out, "shape": grid.shape, "voxel_mm": grid.voxel_size, "units": "1/mm"}
     lines = [f"wrote {out}: {nx} x {ny} x {nz} voxels of {metric(grid.voxel_size)}, in 1/mm"]
-    if steps:
-        values["steps"] = steps
-        lines += [f"  cycle {s.cycle}, {s.level}: misfit {s.misfit:.4g} before" for s in steps]
+    if done.steps:
+        values["steps"] = done.steps
+        lines += [f"  cycle {s.cycle}, {s.level}: misfit {s.misfit:.4g} before" for s in done.steps]
     console.summary(values, "\n".join(lines))
 
 
@@ -182,65 +173,3 @@ def _start(path: Path, grid: "VolumeGrid") -> Any:
     if found.shape != grid.shape:
         raise InputError.at(path, "/volume", f"shape {found.shape}", f"{grid.shape} as of the scan")
     return volume
-
-
-def _imgr(
-    scan: "Scan",
-    out: Path,
-    grid: "VolumeGrid",
-    motion: "Motion | None",
-    valid_views: "NDArray[np.bool_] | None",
-    align: bool,
-    options: dict[str, Any],
-    resume: bool,
-    console: Console,
-    progress: "ProgressCallback",
-    limits: dict[str, Any],
-) -> "tuple[ImgrStep, ...]":
-    """Reconstruct by multigrid iteration, keep what Ctrl-C leaves, or go on from there."""
-    import numpy as np
-
-    from clra.app.exit_status import InterruptedCommandError
-    from clra.app.resuming import SavedState, fingerprint
-    from clra.io.volumes.volume_files import open_volume
-    from clra.methods.reconstruction.imgr import imgr
-    from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
-    from clra.methods.reconstruction.iterative import sorted_options
-    from clra.ops.runtime.devices import usable_devices
-    from clra.ops.streaming.stream import Stream
-
-    osem, cycle = sorted_options("imgr", options)
-    settings = {
-        "align": align,
-        "motion": motion
-        and f"{motion.cause} " + fingerprint(motion.shift_u, motion.shift_v, motion.magnification),
-        "valid_views": None if valid_views is None else fingerprint(valid_views),
-        "grid": fingerprint(np.array([*grid.shape, grid.voxel_size, *grid.centre])),
-        **options,
-    }
-    saved = SavedState(out, scan, settings)
-    stream = Stream(usable_devices(console.device, progress)[0], report=progress, **limits)
-    state = saved.load(stream, grid) if resume else None
-    try:
-        found = imgr(
-            stream,
-            scan,
-            grid,
-            align=align,
-            motion=motion,
-            valid_views=valid_views,
-            truth=scan.truth,
-            osem=osem,
-            state=state,
-            **cycle,
-        )
-    except ReconstructionInterrupted as stopped:
-        saved.save(stopped.state)
-        last = stopped.state.steps[-1]
-        raise InterruptedCommandError(
-            f"{saved.folder} keeps cycle {last.cycle} up to {last.level}, --resume goes on"
-        ) from None
-    with open_volume(out, grid) as target:
-        found.volume.write(target)
-    saved.clear()
-    return found.steps

@@ -177,8 +177,8 @@ def _errors(errors: Errors) -> str:
     names = {
         "raw": "mae",
         "gauge-free": "gauge_free_mae",
-        "raw, without flagged views": "believed_mae",
-        "gauge-free, without flagged views": "believed_gauge_free_mae",
+        "raw, without flagged views": "valid_mae",
+        "gauge-free, without flagged views": "valid_gauge_free_mae",
     }
     rows = [
         [told, *(f"{means[f'{name}_{c}']:{form}}" for c, form in _COMPONENTS.items())]

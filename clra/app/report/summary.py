@@ -68,7 +68,7 @@ class Errors:
         """Mean absolute errors by name; those of valid views where some are not."""
         errors = {"mae": self.raw, "gauge_free_mae": self.gauge_free}
         if not self.valid_views.all():
-            errors |= {f"believed_{name}": of[self.valid_views] for name, of in errors.items()}
+            errors |= {f"valid_{name}": of[self.valid_views] for name, of in errors.items()}
         components = ("u", "v", "magnification")
         return {
             f"{name}_{component}": float(mean)
@@ -200,6 +200,7 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "device": result.device,
         "seconds": seconds,
         "history": result.history,
+        "quality": None if result.quality is None else result.quality.as_dict(),
         **(errors.means() if errors else {}),
     }
     lines = {
@@ -224,7 +225,7 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         means = errors.means()
         lines["error"] = _error(means, "", result)
         if result.flagged:
-            lines["not flagged"] = _error(means, "believed_", result)
+            lines["not flagged"] = _error(means, "valid_", result)
     return values, table(lines)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from pathlib import Path
@@ -13,15 +14,19 @@ import tifffile
 from numpy.typing import DTypeLike, NDArray
 
 from clra.errors import InputError
+from clra.io.provenance import Provenance
 from clra.io.units import TO_MM, factor
 from clra.model.grid import VolumeGrid
 
 # The offsets of a plain TIFF have 32 bits; room is left for its headers.
 _PLAIN_TIFF = (1 << 32) - (1 << 25)
+_PROVENANCE = "clra provenance: "
 _CENTRE = re.compile(r"clra centre x y z mm: (\S+) (\S+) (\S+)")
 
 
-def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLike]:
+def tiff_layout(
+    path: Path, grid: VolumeGrid, units: str, provenance: Provenance
+) -> tuple[int, DTypeLike]:
     """Write everything of a TIFF but the voxels.
 
     ImageJ reads the voxel of its own plain TIFF; a BigTIFF cannot be one and carries OME's text.
@@ -34,6 +39,8 @@ def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLik
         Of the volume.
     units : str
         Of the voxels.
+    provenance : mapping of str to str
+        Goes into the description, a line of JSON; the program into the tag Software.
 
     Returns
     -------
@@ -44,6 +51,7 @@ def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLik
     """
     size = grid.voxel_size
     note = "clra centre x y z mm: {!r} {!r} {!r}\nunits: {}\n".format(*grid.centre, units)
+    note += f"{_PROVENANCE}{json.dumps(dict(provenance))}\n"
     plain = 4 * int(np.prod(grid.shape, dtype=np.int64)) < _PLAIN_TIFF
     described: dict[str, Any]
     if plain:
@@ -60,6 +68,7 @@ def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLik
         imagej=plain,
         ome=not plain,
         photometric="minisblack",
+        software=f"clra {provenance.get('clra_version', '')}".strip(),
         # ImageJ counts in its own unit, others in centimetres.
         resolution=(1 / size, 1 / size) if plain else (10 / size, 10 / size),
         resolutionunit="NONE" if plain else "CENTIMETER",
@@ -120,7 +129,11 @@ def tiff_volume(
     except Exception as error:  # tifffile fails in many ways on what is no TIFF
         raise InputError(f"{os.fspath(path)}: cannot be read as TIFF: {error}") from error
     told = _CENTRE.search(note)
-    centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
+    try:
+        centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
+    except ValueError:
+        assert told is not None
+        raise InputError.at(path, "centre", repr(told[0]), "three numbers") from None
     return voxels, sizes[-1], centre
 
 

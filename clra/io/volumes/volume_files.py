@@ -12,9 +12,12 @@ import h5py
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+import clra
 from clra.errors import InputError, OutputError
 from clra.io.atomic import atomic_path
+from clra.io.damage import reads
 from clra.io.hdf5 import open_hdf5, require, text
+from clra.io.provenance import Provenance
 from clra.io.units import TO_MM, factor
 from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.io.volumes.tiff import tiff_layout, tiff_volume
@@ -30,7 +33,11 @@ _PIECE = 8 << 20
 
 @contextmanager
 def open_volume(
-    path: str | os.PathLike[str], grid: VolumeGrid, *, units: str = "1/mm"
+    path: str | os.PathLike[str],
+    grid: VolumeGrid,
+    *,
+    units: str = "1/mm",
+    provenance: Provenance | None = None,
 ) -> Iterator[SlabWriter]:
     """Open a volume for writing slab by slab; the file appears whole or not at all.
 
@@ -42,6 +49,9 @@ def open_volume(
         Of the whole volume.
     units : str
         Of the voxels.
+    provenance : mapping of str to str, optional
+        Where the volume comes from, see :func:`clra.io.provenance.provenance`: attributes of the
+        root in HDF5, a line of the description in TIFF. The version of clra is kept in any case.
 
     Yields
     ------
@@ -63,7 +73,8 @@ def open_volume(
     size = 4 * int(np.prod(grid.shape, dtype=np.int64))
     with atomic_path(path, size + (1 << 20)) as temporary:
         lay_out = _hdf5_layout if suffix in HDF5 else tiff_layout
-        offset, dtype = lay_out(temporary, grid, units)
+        made = {"clra_version": clra.__version__, **(provenance or {})}
+        offset, dtype = lay_out(temporary, grid, units, made)
         with SlabWriter(temporary, offset, grid.shape, dtype) as writer:
             yield writer
 
@@ -74,6 +85,7 @@ def write_volume(
     grid: VolumeGrid,
     *,
     units: str = "1/mm",
+    provenance: Provenance | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write a volume; the file appears whole or not at all.
@@ -88,6 +100,8 @@ def write_volume(
         Of the volume.
     units : str
         Of the voxels.
+    provenance : mapping of str to str, optional
+        As for :func:`open_volume`.
     progress : callable, optional
         Called with a ``Progress`` as planes are written.
 
@@ -102,13 +116,14 @@ def write_volume(
         raise InputError(f"volume: found shape {volume.shape}, expected {grid.shape} as in grid")
     planes, rows, columns = grid.shape
     step = max(1, _PIECE // (4 * rows * columns))
-    with open_volume(path, grid, units=units) as writer:
+    with open_volume(path, grid, units=units, provenance=provenance) as writer:
         for start in range(0, planes, step):
             stop = min(start + step, planes)
             writer.write(start, np.asarray(volume[start:stop]))
             tell(progress, "writing", stop, planes)
 
 
+@reads
 def read_volume(
     path: str | os.PathLike[str], start: int = 0, stop: int | None = None
 ) -> tuple[NDArray[np.float32], VolumeGrid]:
@@ -141,9 +156,12 @@ def read_volume(
     return _read_hdf5(path, slice(start, stop))
 
 
-def _hdf5_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLike]:
+def _hdf5_layout(
+    path: Path, grid: VolumeGrid, units: str, provenance: Provenance
+) -> tuple[int, DTypeLike]:
     """Write everything but the voxels; return where they go and as what."""
     with h5py.File(path, "w") as file:
+        file.attrs.update(provenance)
         dataset, offset = reserve(file, "volume", grid.shape, np.float32)
         dataset.attrs.update(
             units=units,
@@ -164,16 +182,28 @@ def _read_hdf5(
         dataset = require(file, "volume", "a volume as clra writes it")
         if dataset.ndim != 3:
             raise InputError.at(path, "/volume", f"{dataset.ndim} axes", "z, y, x")
-        size = dataset.attrs.get("voxel_size")
-        if size is None:
-            raise InputError.at(path, "/volume@voxel_size", "nothing", "the size of a voxel")
+        size = _numbers(dataset, "voxel_size", ())
         scale = factor(text(dataset.attrs.get("voxel_size_units", "mm")), TO_MM)
         if scale is None:
             raise InputError.at(path, "/volume@voxel_size_units", "an unknown unit", "mm")
-        centre = np.asarray(dataset.attrs.get("centre", (0, 0, 0)), np.float64) * scale
-        grid = _grid(path, dataset.shape, float(size) * scale, tuple(centre.ravel()))
+        centre = _numbers(dataset, "centre", (0.0, 0.0, 0.0))
+        grid = _grid(path, dataset.shape, size[0] * scale, tuple(value * scale for value in centre))
         first, last, _ = planes.indices(grid.shape[0])
         return np.asarray(dataset[first:last], np.float32), grid.slab(first, last)
+
+
+def _numbers(dataset: h5py.Dataset, name: str, default: tuple[float, ...]) -> list[float]:
+    """Read an attribute of one or more numbers."""
+    value = dataset.attrs.get(name, default)
+    try:
+        numbers = [float(v) for v in np.asarray(value, np.float64).ravel()]
+    except (TypeError, ValueError):
+        numbers = []
+    if not numbers:
+        where = f"{dataset.name}@{name}"
+        found = "nothing" if value is default else repr(value)
+        raise InputError.at(dataset.file.filename, where, found, "numbers")
+    return numbers
 
 
 def _grid(

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.alignment.align import align
-from clra.model.angular_coverage import covered
 from clra.model.detector_pose import with_detector
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.rotation_sense import opposite_rotation
+from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan
 from clra.model.schedule import level_name
 from clra.ops.filtering.ramp import RampFilter, taper

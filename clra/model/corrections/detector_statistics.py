@@ -26,6 +26,8 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # Neighbours lie at once and twice these distances on both sides. One of the four may be bad as
 # well: so squares of 3 x 3 bad pixels, and three dead lines side by side, are found.
 _NEAR = (1, 2)
+# Fewer columns, or rows, do not tell which of them are dead: scans of two rows are no rarity.
+_FEWEST = 12
 # Chance at which a good pixel is called insensitive or standing out because of noise alone.
 _CHANCE = 1e-10
 # A pixel's variance is this part of its neighbours', at most, if it is insensitive: samples with
@@ -192,6 +194,8 @@ class DetectorStatistics:
     def _dead_lines(self, mean: Floats, variance: Floats) -> NDArray[np.intp]:
         """Columns that show nothing of what lies beside them; up to three side by side."""
         rows, columns = variance.shape
+        if columns < _FEWEST:
+            return np.zeros(0, np.intp)
         least = _EXTREME * self._least_excess(mean, variance)
         best = np.zeros(columns)
         for distance in _NEAR:

@@ -21,7 +21,7 @@ from projector_cases import (
 )
 
 from clra import VolumeGrid, circular
-from clra.ops.projection import layout, projector
+from clra.ops.projection import cpu_forms, gpu_forms, layout
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.runtime.profile import forced
 
@@ -58,8 +58,10 @@ def test_a_view_that_misses_the_volume_gives_nothing(queue, form):
 def test_views_may_come_in_chunks(queue, monkeypatch, request, form, small):
     if small:  # scratch for two views, parts of two planes
         monkeypatch.setattr(layout, "_LEAST_VIEWS", 2)
-        monkeypatch.setattr(projector, "_PART_BYTES", 0)
-        monkeypatch.setattr(projector, "_LEAST_PLANES", 2)
+        monkeypatch.setattr(cpu_forms, "_PART_BYTES", 0)
+        monkeypatch.setattr(gpu_forms, "_RUN", 2)
+        monkeypatch.setattr(gpu_forms, "_MOST_WORK", 5 * np.prod(GRID.shape))
+        monkeypatch.setattr(cpu_forms, "_LEAST_PLANES", 2)
         tight = forced(replace(form, projector_bytes=0))
         tight.__enter__()
         request.addfinalizer(lambda: tight.__exit__(None, None, None))
