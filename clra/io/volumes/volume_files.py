@@ -13,13 +13,8 @@ from numpy.typing import NDArray
 
 import clra
 from clra.errors import InputError, OutputError
-<<<<<<< HEAD
-from clra.io.atomic import atomic_path
-from clra.io.damage import reads
-from clra.io.hdf5 import open_hdf5, require, text
-=======
 from clra.io.atomic import atomic_folder, atomic_path
->>>>>>> outputs
+from clra.io.damage import reads
 from clra.io.provenance import Provenance
 from clra.io.volumes.hdf5_volume import hdf5_writer, read_hdf5_volume
 from clra.io.volumes.integer_limits import Limits, integer_writer
@@ -225,50 +220,6 @@ def read_volume(
     InputError
         If it is no volume, or does not tell the size of a voxel.
     """
-<<<<<<< HEAD
-    if Path(path).suffix.lower() in TIFF:
-        voxels, size, centre = tiff_volume(path)
-        grid = _grid(path, voxels.shape, size, centre)
-        first, last, _ = slice(start, stop).indices(grid.shape[0])
-        return np.asarray(voxels[first:last], np.float32), grid.slab(first, last)
-    return _read_hdf5(path, slice(start, stop))
-
-
-def _hdf5_layout(
-    path: Path, grid: VolumeGrid, units: str, provenance: Provenance
-) -> tuple[int, DTypeLike]:
-    """Write everything but the voxels; return where they go and as what."""
-    with h5py.File(path, "w") as file:
-        file.attrs.update(provenance)
-        dataset, offset = reserve(file, "volume", grid.shape, np.float32)
-        dataset.attrs.update(
-            units=units,
-            axes="z, y, x",
-            voxel_size=grid.voxel_size,
-            voxel_size_units="mm",
-            centre=grid.centre,
-            centre_units="mm",
-            centre_axes="x, y, z",
-        )
-    return offset, np.float32
-
-
-def _read_hdf5(
-    path: str | os.PathLike[str], planes: slice
-) -> tuple[NDArray[np.float32], VolumeGrid]:
-    with open_hdf5(path) as file:
-        dataset = require(file, "volume", "a volume as clra writes it")
-        if dataset.ndim != 3:
-            raise InputError.at(path, "/volume", f"{dataset.ndim} axes", "z, y, x")
-        size = _numbers(dataset, "voxel_size", ())
-        scale = factor(text(dataset.attrs.get("voxel_size_units", "mm")), TO_MM)
-        if scale is None:
-            raise InputError.at(path, "/volume@voxel_size_units", "an unknown unit", "mm")
-        centre = _numbers(dataset, "centre", (0.0, 0.0, 0.0))
-        grid = _grid(path, dataset.shape, size[0] * scale, tuple(value * scale for value in centre))
-        first, last, _ = planes.indices(grid.shape[0])
-        return np.asarray(dataset[first:last], np.float32), grid.slab(first, last)
-=======
     suffix = Path(path).suffix.lower()
     openers = {".zarr": zarr_volume, ".nrrd": nrrd_volume, ".raw": raw_volume}
     openers |= dict.fromkeys(TIFF, tiff_volume)
@@ -280,21 +231,6 @@ def _read_hdf5(
     grid = _grid(path, voxels.shape, size, centre)
     first, last, _ = slice(start, stop).indices(grid.shape[0])
     return decoded(voxels[first:last], *scaling), grid.slab(first, last)
->>>>>>> outputs
-
-
-def _numbers(dataset: h5py.Dataset, name: str, default: tuple[float, ...]) -> list[float]:
-    """Read an attribute of one or more numbers."""
-    value = dataset.attrs.get(name, default)
-    try:
-        numbers = [float(v) for v in np.asarray(value, np.float64).ravel()]
-    except (TypeError, ValueError):
-        numbers = []
-    if not numbers:
-        where = f"{dataset.name}@{name}"
-        found = "nothing" if value is default else repr(value)
-        raise InputError.at(dataset.file.filename, where, found, "numbers")
-    return numbers
 
 
 def _grid(

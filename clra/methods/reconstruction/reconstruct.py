@@ -22,24 +22,16 @@ from clra.methods.reconstruction.iterative import Options
 from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevich
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
-<<<<<<< HEAD
-from clra.model.corrections.correction_options import CorrectionOptions
-=======
 from clra.model.binning import binned_motion, binned_scan
-from clra.model.corrections.options import CorrectionOptions
->>>>>>> outputs
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
 from clra.model.grid import Region, VolumeGrid, volume_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
-<<<<<<< HEAD
 from clra.model.validation import checked_valid_views
-=======
-from clra.model.validation import believed_views
 from clra.ops.filtering.ramp import WINDOWS
->>>>>>> outputs
 from clra.ops.runtime.devices import usable_devices
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -245,13 +237,8 @@ def reconstruct_into(
         scan = prepared(scan, corrections, progress=progress)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
-<<<<<<< HEAD
-        grid = grid or default_grid(scan.geometry)
-=======
         small = binned_scan(scan, binning)
         grid = grid or volume_grid(small.geometry, roi=roi, voxel_size=voxel_size)
-        devices = usable_devices(device, progress)
->>>>>>> outputs
         limits: dict[str, Any] = {
             "max_device_memory": max_device_memory,
             "max_host_memory": max_host_memory,
