@@ -8,9 +8,9 @@
 // The forms for GPUs; CPUs run adjoint_columns.cl, or adjoint_tilted.cl and adjoint_steep.cl.
 // Neighbouring work-items are neighbours along x and sum VOXELS voxels along z. Where v is parallel
 // to z, a column of rays meets the voxels' plane at one q, and at rows evenly spaced along z: where
-// a ray weighs, and how much, is one multiply-add a row; adjoint_leaning.cl does alike where v leans.
-// Else the rays within the bounding box of a voxel's support are tried one by one. Every voxel, and the one beyond, has to be in front of
-// every source.
+// a ray weighs, and how much, is one multiply-add a row; adjoint_leaning.cl does alike where v
+// leans. Else the rays within the bounding box of a voxel's support are tried one by one. Every
+// voxel, and the one beyond, has to be in front of every source.
 //
 // Global size (nx, ny, ceil(nz / VOXELS)), rounded up at will.
 
@@ -69,6 +69,7 @@ always_inlined void add_columns(
         if (INSIDE || (top >= 1.0f && bottom < rows - 3.0f && size >= 0.5f)) {
             const uint base = UNIT * ((uint)c - BIAS * (uint)COLUMNS);
             const float w1 = 1.0f - size, w2 = w1 - size;
+#define ADD(weight, n) share = fma(SATURATE(weight), PIXEL(s.image, at, n), share);
 #define TAPS(MORE)                                                                                 \
     _Pragma("unroll") for (int k = 0; k < VOXELS; ++k)                                             \
     {                                                                                              \
@@ -76,17 +77,17 @@ always_inlined void add_columns(
         const float f = row - (whole - MAGIC);                                                     \
         const uint at = WHOLE(whole) * (UNIT * COLUMNS) + base;                                    \
         float share = SATURATE(fma(-size, f, 1.0f)) * PIXEL(s.image, at, 0);                       \
-        share = fma(SATURATE(fma(size, f, w1)), PIXEL(s.image, at, COLUMNS), share);               \
+        ADD(fma(size, f, w1), COLUMNS)                                                             \
         MORE                                                                                       \
         sum[k] = fma(w, share, sum[k]);                                                            \
     }
             if (INSIDE == 2 || (INSIDE != 4 && size >= 1.0f)) {
                 TAPS()
             } else {
-                TAPS(share = fma(SATURATE(fma(-size, f, w1)), PIXEL(s.image, at, -COLUMNS), share);
-                     share = fma(SATURATE(fma(size, f, w2)), PIXEL(s.image, at, 2 * COLUMNS), share);)
+                TAPS(ADD(fma(-size, f, w1), -COLUMNS) ADD(fma(size, f, w2), 2 * COLUMNS))
             }
 #undef TAPS
+#undef ADD
         } else {
 #pragma unroll 1
             for (int k = 0; k < VOXELS; ++k) {

@@ -2,8 +2,8 @@
 // each other roughly along z, within 45 degrees, where no ray advances fastest along z.
 //
 // A work-item sums VOXELS voxels along z. Of each detector column that may share in them it finds
-// the row that passes a voxel's height in the voxel's plane, and takes the rays of two or three rows
-// around; where rows are less than 2/3 of a voxel apart, along the borders and where rays are
+// the row that passes a voxel's height in the voxel's plane, and takes the rays of two or three
+// rows around; where rows are less than 2/3 of a voxel apart, along the borders and where rays are
 // sampled across either axis, it tries the rays one by one.
 //
 // Global size (nx, ny, ceil(nz / VOXELS)), rounded up at will.
@@ -39,7 +39,7 @@ always_inlined void add_leaning(
         const float dp = fma((float)c, m[18 + p], m[15 + p]);
         const float dq = fma((float)c, m[18 + q], m[15 + q]);
         const float dz = fma((float)c, m[20], m[17]);
-        // The row that passes voxel k's height in its plane is (start + k dp) / (turn - k m[21 + p]).
+        // The row that passes voxel k's height in its plane: (start + k dp) / (turn - k m[21 + p]).
         const float start = -fma(away_z, dp, away_p * dz);
         const float row0 = start * native_recip(turn);
         const float row9 = fma(last, dp, start) * native_recip(fma(-last, m[21 + p], turn));
