@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.methods.alignment.align import align as align
     from clra.methods.alignment.result import AlignmentResult as AlignmentResult
     from clra.methods.correction import correct as correct
+    from clra.methods.reconstruction.iterative import Multigrid as Multigrid
+    from clra.methods.reconstruction.osem_tr import OrderedSubsets as OrderedSubsets
     from clra.methods.reconstruction.reconstruct import reconstruct as reconstruct
     from clra.model.geometry import ConeBeamGeometry as ConeBeamGeometry
     from clra.model.grid import VolumeGrid as VolumeGrid
@@ -61,6 +63,8 @@ _HOMES = {
     "align": "clra.methods.alignment.align",
     "AlignmentResult": "clra.methods.alignment.result",
     "reconstruct": "clra.methods.reconstruction.reconstruct",
+    "OrderedSubsets": "clra.methods.reconstruction.osem_tr",
+    "Multigrid": "clra.methods.reconstruction.iterative",
     "correct": "clra.methods.correction",
     "devices": "clra.ops.runtime.devices",
     "ForwardProjector": "clra.ops.projection.projector",

@@ -50,7 +50,8 @@ def test_findings_are_collected_once_and_in_order() -> None:
         with collected() as inner:
             warn("b", "second", "do this")
             warn("b", "second", "do this")
-            assert collected_so_far() == tuple(outer)
+            assert collected_so_far() == tuple(inner)
+            assert collected_so_far(outermost=True) == tuple(outer)
     assert [finding.code for finding in outer] == ["a", "b"]
     assert [str(finding) for finding in inner] == ["second: do this"]
     assert collected_so_far() == ()

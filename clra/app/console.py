@@ -16,6 +16,7 @@ import numpy as np
 import typer
 
 from clra.app import progress_bar
+from clra.findings import collected, collected_so_far
 
 if TYPE_CHECKING:
     from clra.io.scanners.scanner_options import ScannerOptions
@@ -56,9 +57,12 @@ class Console:
         print(to_json(values) if self.json else text)
 
     def summary(self, values: Mapping[str, Any], text: str) -> None:
-        """Print what a command that wrote a file has to say of it, unless quiet."""
+        """Print what a command that wrote a file has to say of it, unless quiet.
+
+        As JSON it has the findings of the whole command, too.
+        """
         if self.json or not self.quiet:
-            self.result(values, text)
+            self.result({**values, "warnings": collected_so_far(outermost=True)}, text)
 
 
 @dataclass(frozen=True)
@@ -282,12 +286,13 @@ def command(
             for key, group in groups.items():
                 values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
             if not writes:
-                function(**values)
+                with collected():
+                    function(**values)
                 return
             from clra.io.claims import one_run
 
             writing = Writing(**{f.name: values.pop(f.name) for f in fields(Writing)})
-            with one_run(overwrite=not writing.no_overwrite):
+            with one_run(overwrite=not writing.no_overwrite), collected():
                 function(**values)
 
         # typer learns a command's options from its signature and its annotations.

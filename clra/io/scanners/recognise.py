@@ -149,7 +149,13 @@ def read_scanner(
     if found is None:
         return None
     each, place = found
-    return each.read(place, options or ScannerOptions())
+    try:
+        return each.read(place, options or ScannerOptions())
+    except InputError as error:
+        # What a geometry refuses does not know whence it came.
+        if str(place.parent) in str(error) or str(error).startswith("--"):
+            raise
+        raise InputError(f"{place}: {error}") from error
 
 
 def read_start_motion(

@@ -7,6 +7,7 @@ simulated ones come out in the frame of the measured ones, so that what registra
 is left.
 """
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -40,6 +41,8 @@ from clra.model.schedule import Stage, converged, level_name, update_size
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -207,6 +210,15 @@ class CoarseToFine:
 
     def _keep(self, stage: int, done: int) -> None:
         """Keep what the iterations so far gave: `done` of a stage."""
+        last = self.history[-1]
+        _LOG.info(
+            "%s %d: median update %.3g, %.3g pixel, correlation %.3f",
+            last.level,
+            last.iteration,
+            last.update_u_median,
+            last.update_v_median,
+            last.correlation,
+        )
         if self.checkpoint is None:
             return
         level, update = self.last

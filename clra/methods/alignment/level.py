@@ -87,11 +87,8 @@ class Level:
         """
         # Motions are in full-resolution pixels: absorb first, then bin.
         geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
-        estimator = self.solver.registration(
-            self.stream, self.scan, self.radiographs, first=first, magnification=magnification
-        )
 
-        def reconstructed(radiographs: Radiographs, doing: str) -> Volume:
+        def reconstructed(radiographs: Radiographs, doing: str | None = None) -> Volume:
             return fitted_fbp(
                 self.stream,
                 radiographs,
@@ -102,7 +99,7 @@ class Level:
                 valid_views=valid_views,
                 circle=self.solver.circle,
                 used=self.used,
-                stage=f"{title}: {doing}",
+                stage=title if doing is None else f"{title}: {doing}",
             )
 
         def registered(radiographs: Radiographs, volume: Volume, doing: str) -> Registered:
@@ -111,14 +108,21 @@ class Level:
                 radiographs,
                 volume,
                 geometry,
-                estimator,
+                # Made anew: it would stand beside the reconstruction's memory.
+                self.solver.registration(
+                    self.stream,
+                    self.scan,
+                    radiographs,
+                    first=first,
+                    magnification=magnification,
+                ),
                 magnification=known,
                 detector=self.scan.geometry.shape,
                 stage=f"{title}: {doing}",
             )
 
         # 2: reconstruct from the corrected radiographs
-        volume = reconstructed(self.radiographs, "reconstructing")
+        volume = reconstructed(self.radiographs)
         # 3, 4: simulate and register
         found = registered(self.radiographs, volume, "registering")
         if measure and self.bias is None and self.solver.is_biased(geometry):
@@ -126,7 +130,7 @@ class Level:
                 self.stream, volume, geometry, self.factor, f"{title}: simulating"
             )
             del volume
-            volume = reconstructed(still, "reconstructing what is simulated")
+            volume = reconstructed(still, "what is simulated")
             self.bias = registered(still, volume, "registering what is simulated").motion
         if self.bias is None:
             return found

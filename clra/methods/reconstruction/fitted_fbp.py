@@ -72,7 +72,7 @@ def fitted_fbp(
     terms = terms if positive else 0
     volumes = VOLUMES if terms else 1
 
-    def reconstructed(measured: Radiographs, onto: Volume | None) -> Volume:
+    def reconstructed(measured: Radiographs, onto: Volume | None, doing: str) -> Volume:
         return ramp_fbp(
             stream,
             measured,
@@ -84,15 +84,20 @@ def fitted_fbp(
             window="ram-lak" if onto is None else _WINDOW,
             volumes=volumes,
             onto=onto,
-            stage=stage,
+            stage=f"{stage}: {doing}",
         )
 
-    volume = reconstructed(radiographs, None)
+    volume = reconstructed(radiographs, None, "reconstructing")
     for _ in range(terms):
         lacking = reprojections(
-            stream, volume, geometry, radiographs.level, stage, lacking_of=(radiographs, used)
+            stream,
+            volume,
+            geometry,
+            radiographs.level,
+            f"{stage}: simulating",
+            lacking_of=(radiographs, used),
         )
-        reconstructed(lacking, volume)
+        reconstructed(lacking, volume, "correcting")
     return volume
 
 

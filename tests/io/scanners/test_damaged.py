@@ -79,6 +79,13 @@ def test_a_detector_before_the_axis(tmp_path: Path) -> None:
         read_scanner(path)
 
 
+def test_what_a_geometry_refuses_names_the_file(tmp_path: Path) -> None:
+    path = vendor.write_geom(tmp_path, None, np.zeros((vendor.VIEWS, 12)))
+    with pytest.raises(InputError) as refused:
+        read_scanner(path, ScannerOptions(shape=vendor.SHAPE))
+    assert str(refused.value).startswith(f"{path}: u and v: parallel or zero in view 0, expected")
+
+
 def test_no_radiographs_beside_the_metadata(tmp_path: Path) -> None:
     path = vendor.write_nikon(tmp_path, None)
     scan = read_scan(path)
