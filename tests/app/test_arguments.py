@@ -2,7 +2,15 @@ from pathlib import Path
 
 import pytest
 
-from clra.app.arguments import detector, interval, pixel, volume_file
+from clra.app.arguments import (
+    detector,
+    interval,
+    limits_of_integers,
+    pixel,
+    region,
+    volume_file,
+)
+from clra.io.volumes.integer_limits import Limits
 
 
 def test_values_are_read():

@@ -37,8 +37,9 @@ def align(
     start: Annotated[
         Path | None,
         typer.Option(
-            metavar="MOTION.h5",
-            help="Motion to start from, of a run that was interrupted or shall be refined.",
+            metavar="MOTION.h5|MOTION.csv",
+            help="Motion to start from, of a run that was interrupted or shall be refined; or a "
+            "table as clra export-motion writes it.",
         ),
     ] = None,
     autofocus: Annotated[
@@ -105,6 +106,7 @@ def align(
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
+    from clra.io.motion_formats.motion_csv import read_motion_csv
     from clra.io.provenance import provenance
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
@@ -132,9 +134,12 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = None if start is None else read_alignment(start)
-    if earlier is not None and start is not None:
-        opened = matched(opened, earlier, start, reading.geometry())
+    earlier = given = None
+    if start is not None and start.suffix.lower() == ".csv":
+        given = read_motion_csv(start)[0]
+    elif start is not None:
+        earlier = read_alignment(start)
+        opened, given = matched(opened, earlier, start, reading.geometry()), earlier.motion
     about = {
         "file": str(scan.absolute()),
         "geometry": reading.geometry(),
@@ -159,7 +164,7 @@ def align(
                 estimate=estimate,
                 gauge=gauge,
                 reference=still,
-                motion=None if earlier is None else earlier.motion,
+                motion=given,
                 device=console.device,
                 progress=progress,
                 checkpoint=checkpoint,
