@@ -103,6 +103,7 @@ kernel required_group void normalise(
     const float radius, // of the field of view, voxels
     const float least, // a voxel with less W is set to 0
     const float scale,
+    const float lowest, // smaller values are raised to it
     const int slices)
 {
     volume += volume_offset;
@@ -127,5 +128,5 @@ kernel required_group void normalise(
     const float dx = i - axis_x, dy = j - axis_y;
     const size_t at = slices ? ((size_t)k * ny + j) * nx + i : ((size_t)j * nx + i) * nz + k;
     const int good = sum > least && dx * dx + dy * dy <= radius * radius;
-    volume[at] = good ? volume[at] * scale / sum : 0.0f;
+    volume[at] = good ? max(volume[at] * scale / sum, lowest) : 0.0f;
 }

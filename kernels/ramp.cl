@@ -8,19 +8,8 @@
 // Lines are numbered through all views: line = view * rows + row. A work-item makes LANES columns
 // of one line. Global sizes are (blocks of LANES columns, lines), rounded up at will.
 
+#include "ramp.clh"
 #include "vectors.clh"
-
-#define VIEW_FIELDS 6 // c0, r0 [pixel], a, b, s [1/pixel^2], factor [1/mm]
-
-typedef struct {
-    float factor, c0, a, quadratic, linear;
-} LineWeight;
-
-static inline float weight_at(const LineWeight w, const int i)
-{
-    const float du = i - w.c0;
-    return w.factor / sqrt(w.quadratic + du * (w.linear + w.a * du));
-}
 
 // of LANES neighbouring columns from column i on
 static inline real weights_at(const LineWeight w, const int i)
@@ -58,15 +47,8 @@ kernel required_group void weight_lines(
     const int i = get_global_id(0) * LANES, line = get_global_id(1);
     if (i >= padded || line >= count)
         return;
-    const int source = first + line, row = source % rows;
-    global const float *view = view_table + (source / rows) * VIEW_FIELDS;
-    const float dv = row - view[1];
-    LineWeight w;
-    w.factor = view[5] * row_weight[row];
-    w.c0 = view[0];
-    w.a = view[2];
-    w.quadratic = 1.0f + view[3] * dv * dv;
-    w.linear = view[4] * dv;
+    const int source = first + line;
+    const LineWeight w = line_weight(view_table, row_weight, source, rows);
     global const float *p = projections + (ulong)source * columns;
     lines += (ulong)line * padded + i;
     ray_weight += (ulong)(source / rows) * ray_stride;
@@ -86,7 +68,7 @@ kernel required_group void weight_lines(
     }
     const int last = min(LANES, padded - i);
     for (int k = 0; k < last; ++k) {
-        const int x = i + k, from = x < columns ? x : (x < middle ? columns - 1 : 0);
+        const int x = i + k, from = source_column(x, columns, padded);
         const float value = p[from] * weight_at(w, from) * ray_weight[from];
         lines[k] = value * (x < columns ? 1.0f : roll[x - columns]);
     }

@@ -8,7 +8,6 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.errors import InputError
-from clra.findings import Finding
 
 
 def align(
@@ -37,9 +36,10 @@ def align(
     start: Annotated[
         Path | None,
         typer.Option(
-            metavar="MOTION.h5|MOTION.csv",
-            help="Motion to start from, of a run that was interrupted or shall be refined; or a "
-            "table as clra export-motion writes it.",
+            metavar="MOTION",
+            help="Motion to start from: MOTION.h5 of a run that was interrupted or shall be "
+            "refined, a table as clra export-motion writes it, or what a scanner's software "
+            "measured (.txrm, .pcr, _TS.csv, CTSimU .json).",
         ),
     ] = None,
     autofocus: Annotated[
@@ -102,16 +102,13 @@ def align(
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError, keeping
-    from clra.app.plausible import doubt_of_turning
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
-    from clra.io.motion_formats.motion_csv import read_motion_csv
     from clra.io.provenance import provenance
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
-    from clra.methods.alignment.autofocus import sharpening_by_turning_back
     from clra.methods.alignment.result import AlignmentInterrupted, finished
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.model.grid import default_grid
@@ -134,12 +131,10 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = given = None
-    if start is not None and start.suffix.lower() == ".csv":
-        given = read_motion_csv(start)[0]
-    elif start is not None:
-        earlier = read_alignment(start)
-        opened, given = matched(opened, earlier, start, reading.geometry()), earlier.motion
+    measured = None if start is None else reading.start_motion(start, opened.views)
+    earlier = None if start is None or measured is not None else read_alignment(start)
+    if earlier is not None and start is not None:
+        opened = matched(opened, earlier, start, reading.geometry())
     about = {
         "file": str(scan.absolute()),
         "geometry": reading.geometry(),
@@ -164,7 +159,7 @@ def align(
                 estimate=estimate,
                 gauge=gauge,
                 reference=still,
-                motion=given,
+                motion=measured if earlier is None else earlier.motion,
                 device=console.device,
                 progress=progress,
                 checkpoint=checkpoint,
@@ -181,20 +176,6 @@ def align(
         write_alignment(out, replace(result, volume=None))
         if volume is None:
             checkpoint.clear()
-        turned = sharpening_by_turning_back(
-            opened.cropped(),
-            result.motion.about(*opened.window_offset),
-            console.device,
-            progress=progress,
-            **limits,
-        )
-        more = {"sharpening_by_turning_back": f"{turned:.3f}"}
-        doubt = doubt_of_turning(turned)
-        doubts = [Finding("rotation", doubt)] if doubt else []
-        result = replace(
-            result, about={**result.about, **more}, warnings=(*result.warnings, *doubts)
-        )
-        write_alignment(out, replace(result, volume=None))
         errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
@@ -215,10 +196,6 @@ def align(
                 **limits,
             )
             write_report(report, findings)
-            known = {str(finding) for finding in result.warnings}
-            doubts += [Finding("report", note) for note in findings.notes if note not in known]
-    for finding in doubts:
-        finding.warn()
     values, text = summary_of(result, errors)
     beside = {"volume": volume, "report": report}
     written = {"file": out, **{name: path for name, path in beside.items() if path}}

@@ -255,7 +255,6 @@ def reconstruct(
     if done.steps:
         values["steps"] = done.steps
         lines += [f"  cycle {s.cycle}, {s.level}: misfit {s.misfit:.4g} before" for s in done.steps]
-    values["warnings"] = done.warnings
     console.summary(values, "\n".join(lines))
 
 

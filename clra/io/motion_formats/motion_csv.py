@@ -48,6 +48,18 @@ def write_motion_csv(
         temporary.write_text(text.getvalue(), encoding="ascii")
 
 
+def is_motion_csv(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a table as :func:`read_motion_csv` reads it, by the names of its columns."""
+    if Path(path).suffix.lower() != ".csv":
+        return False
+    try:
+        start = Path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    except OSError:
+        return False
+    header = next((line for line in start if not line.startswith("#")), "")
+    return COLUMNS[1] in header and COLUMNS[2] in header
+
+
 def read_motion_csv(path: str | os.PathLike[str]) -> tuple[Motion, NDArray[np.bool_]]:
     """Read a motion from a table.
 

@@ -96,14 +96,26 @@ def read_hdf5_volume(
         dataset = require(file, "volume", "a volume as clra writes it")
         if dataset.ndim != 3:
             raise InputError.at(path, "/volume", f"{dataset.ndim} axes", "z, y, x")
-        size = dataset.attrs.get("voxel_size")
-        if size is None:
-            raise InputError.at(path, "/volume@voxel_size", "nothing", "the size of a voxel")
+        size = _numbers(dataset, "voxel_size", ())
         unit = factor(text(dataset.attrs.get("voxel_size_units", "mm")), TO_MM)
         if unit is None:
             raise InputError.at(path, "/volume@voxel_size_units", "an unknown unit", "mm")
-        centre = np.asarray(dataset.attrs.get("centre", (0, 0, 0)), np.float64) * unit
-        scale = float(dataset.attrs.get("scale_factor", 1.0))
-        offset = float(dataset.attrs.get("add_offset", 0.0))
+        centre = tuple(value * unit for value in _numbers(dataset, "centre", (0.0, 0.0, 0.0)))
+        scale = _numbers(dataset, "scale_factor", (1.0,))[0]
+        offset = _numbers(dataset, "add_offset", (0.0,))[0]
         voxels = decoded(dataset[planes], scale, offset)
-        return voxels, dataset.shape, float(size) * unit, tuple(centre.ravel())
+        return voxels, dataset.shape, size[0] * unit, centre
+
+
+def _numbers(dataset: h5py.Dataset, name: str, default: tuple[float, ...]) -> list[float]:
+    """Read an attribute of one or more numbers."""
+    value = dataset.attrs.get(name, default)
+    try:
+        numbers = [float(v) for v in np.asarray(value, np.float64).ravel()]
+    except (TypeError, ValueError):
+        numbers = []
+    if not numbers:
+        where = f"{dataset.name}@{name}"
+        found = "nothing" if value is default else repr(value)
+        raise InputError.at(dataset.file.filename, where, found, "numbers")
+    return numbers

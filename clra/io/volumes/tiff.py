@@ -136,9 +136,13 @@ def tiff_volume(
     except Exception as error:  # tifffile fails in many ways on what is no TIFF
         raise InputError(f"{os.fspath(path)}: cannot be read as TIFF: {error}") from error
     told = _CENTRE.search(note)
-    centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
     line = _SCALED.search(note)
-    scaling = (float(line[1]), float(line[2])) if line else (1.0, 0.0)
+    try:
+        centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
+        scaling = (float(line[1]), float(line[2])) if line else (1.0, 0.0)
+    except ValueError:
+        found = repr((told or line or [""])[0])
+        raise InputError.at(path, "centre", found, "three numbers") from None
     return voxels, sizes[-1], centre, scaling
 
 

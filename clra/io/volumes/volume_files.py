@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import clra
 from clra.errors import InputError, OutputError
 from clra.io.atomic import atomic_folder, atomic_path
+from clra.io.damage import reads
 from clra.io.provenance import Provenance
 from clra.io.volumes.hdf5_volume import hdf5_writer, read_hdf5_volume
 from clra.io.volumes.integer_limits import Limits, integer_writer
@@ -193,6 +194,7 @@ def write_volume(
             tell(progress, "writing", stop, planes)
 
 
+@reads
 def read_volume(
     path: str | os.PathLike[str], start: int = 0, stop: int | None = None
 ) -> tuple[NDArray[np.float32], VolumeGrid]:

@@ -17,6 +17,7 @@ from clra.model.view_selection import runs, views_that_see
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage, around
 from clra.ops.projection.projector import BackProjector
+from clra.ops.streaming.multigrid import add_to_slab
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import PlaneWriter, Volume
@@ -32,10 +33,12 @@ def ramp_fbp(
     stage: str = "back-projecting",
     volumes: int = 1,
     circle: bool = True,
+    positive: bool = False,
     window: str = "ram-lak",
     extend: float | None = None,
     planes: slice | None = None,
     target: PlaneWriter | None = None,
+    onto: Volume | None = None,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
 
@@ -66,6 +69,8 @@ def ramp_fbp(
         How many volumes like this one the device has to hold at a time.
     circle : bool
         Leave zero what lies outside the circle that all views see.
+    positive : bool
+        Raise negative attenuations to zero.
     window : {"ram-lak", "shepp-logan", "hann"}
         Of the ramp filter.
     extend : float, optional
@@ -75,6 +80,9 @@ def ramp_fbp(
         Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
+    onto : Volume, optional
+        On this grid, in the same slabs: changed to ``max(0, onto + what is reconstructed)`` and
+        returned. `positive`, `planes` and `target` do not go with it.
 
     Returns
     -------
@@ -117,7 +125,7 @@ def ramp_fbp(
         allocator=stream.memory,
     )
     coverage.compute(queue)
-    volume = Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
+    volume = onto or Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
     slabs = volume.slabs
     seeing = [chosen & views_that_see(geometry, slab) for slab in slabs]
     total, done = sum(int(views.sum()) for views in seeing), 0
@@ -131,7 +139,7 @@ def ramp_fbp(
             for chunk in stream.chunks(run.stop - run.start, filtered_bytes):
                 views = slice(run.start + chunk.start, run.start + chunk.stop)
                 stream.report(stage, done, total)
-                measured = stream.upload(radiographs.read(views))
+                measured = radiographs.on_device(stream, views)
                 filtered = stream.empty((len(measured), *ramp.geometry.shape))
                 ready = ramp(queue, filtered, measured, views=views)
                 event = back(
@@ -145,8 +153,13 @@ def ramp_fbp(
                 del measured, filtered
                 done += views.stop - views.start
         first = wanted.start - near.start + volume.planes[index].start
-        coverage.normalise(queue, attenuation, scale, first=first, volume_order="yxz")
-        if target is None:
+        lowest = 0.0 if positive else -math.inf
+        coverage.normalise(
+            queue, attenuation, scale, first=first, lowest=lowest, volume_order="yxz"
+        )
+        if onto is not None:
+            add_to_slab(stream, onto, index, attenuation)
+        elif target is None:
             volume.put(index, attenuation)
         else:
             volume.write_slab(index, attenuation, target)

@@ -23,14 +23,14 @@ from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevic
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
 from clra.model.binning import binned_motion, binned_scan
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
 from clra.model.grid import Region, VolumeGrid, volume_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
-from clra.model.validation import believed_views
+from clra.model.validation import checked_valid_views
 from clra.ops.filtering.ramp import WINDOWS
 from clra.ops.runtime.devices import usable_devices
 from clra.ops.streaming.radiographs import Radiographs
@@ -227,18 +227,18 @@ def reconstruct_into(
         motion = alignment.motion
         valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
-        valid_views = believed_views(valid_views, scan.views)
+        valid_views = checked_valid_views(valid_views, scan.views)
     options = iterative.checked_options(method, options)
     keeping, own = checkpoint_of(checkpoint, resume)
     if keeping is not None and keeping.resume and options is None and not align:
         raise InputError(f"resume: found it with {method} alone, which keeps nothing on its way")
     with collected() as findings:
+        devices = usable_devices(device, progress)
         scan = prepared(scan, corrections, progress=progress)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
         small = binned_scan(scan, binning)
         grid = grid or volume_grid(small.geometry, roi=roi, voxel_size=voxel_size)
-        devices = usable_devices(device, progress)
         limits: dict[str, Any] = {
             "max_device_memory": max_device_memory,
             "max_host_memory": max_host_memory,

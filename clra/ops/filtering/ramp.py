@@ -13,6 +13,7 @@ from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.sampling.ray_weights import RayWeights, widened
 from clra.ops.filtering.fft import RealFFT, fast_length
+from clra.ops.filtering.ramp_transform import RampTransform, transform_length
 from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
 from clra.ops.runtime.kernel import Step
@@ -144,8 +145,31 @@ class RampFilter:
         self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
         margin = math.ceil(extend * self._columns)
         self._wider = (0, 0) if ray_weights is None else ray_weights.beyond
-        beyond = margin + max(self._wider)
-        self.padded = fast_length(context, 2 * (self._columns + beyond), backend)
+        least = 2 * (self._columns + margin + max(self._wider))
+        length = transform_length(context, least) if backend is None else None
+        self.padded = length or fast_length(context, least, backend)
+        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
+        self._view_weight = view_weights(view_weight, self._views)
+        self._ray_weights = ray_weights
+        self._alike = to_device(context, np.ones(self._columns))
+        self._roll = to_device(context, _roll(self.padded - self._columns, margin, self._columns))
+        self._last: list[cl.Event] = []
+        self.set_geometry(geometry)
+        spectrum = _ramp_spectrum(self.padded, window)
+        self._transform = RampTransform(context, spectrum) if length else None
+        self.scratch_bytes = 0
+        if length is None:
+            self._in_steps(context, spectrum, backend, allocator, scratch_limit)
+
+    def _in_steps(
+        self,
+        context: cl.Context,
+        spectrum: NDArray[np.float32],
+        backend: str | None,
+        allocator: Allocator | None,
+        scratch_limit: int | None,
+    ) -> None:
+        """Prepare to weigh lines, to transform them and to cut them out."""
         self._lanes = profile_of(context).image_lanes
         most = within(profile_of(context).filter_bytes, scratch_limit) // (4 * self.padded)
         lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
@@ -156,14 +180,7 @@ class RampFilter:
         defines = {"LANES": self._lanes}
         self._weight = Step(context, "ramp.cl", "weight_lines", (64, 2), defines)
         self._cut = Step(context, "ramp.cl", "cut_lines", (64, 2), defines)
-        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
-        self._view_weight = view_weights(view_weight, self._views)
-        self._ray_weights = ray_weights
-        self._alike = to_device(context, np.ones(self._columns))
-        self._roll = to_device(context, _roll(self.padded - self._columns, margin, self._columns))
-        self._ramp = to_device(context, _ramp_spectrum(self.padded, window))
-        self._last: list[cl.Event] = []
-        self.set_geometry(geometry)
+        self._ramp = to_device(context, spectrum)
 
     def filtered_geometry(self, geometry: ConeBeamGeometry) -> ConeBeamGeometry:
         """Return the geometry of the filtered radiographs of a geometry that is to be set."""
@@ -230,6 +247,13 @@ class RampFilter:
         if self._ray_weights is not None:
             table = self._ray_weights.at(np.arange(self._columns), slice(start, stop))
             rays, stride = to_device(self._context, table), self._columns
+        if self._transform is not None:
+            tables = self._view_table[start:], self._row_weight, rays, self._roll
+            event = self._transform(
+                queue, filtered_out, projections, tables, stride, self._wider[0], events
+            )
+            self._last = [event]
+            return event
         for first in range(0, total, len(self._lines)):
             count = min(len(self._lines), total - first)
             part = self._lines[:count]

@@ -192,6 +192,7 @@ class Coverage:
         scale: float,
         *,
         first: int = 0,
+        lowest: float = -math.inf,
         volume_order: str = "zyx",
         wait_for: Sequence[cl.Event] | None = None,
     ) -> cl.Event:
@@ -212,6 +213,8 @@ class Coverage:
             Factor.
         first : int
             Plane of the grid with which the volume begins.
+        lowest : float
+            Smaller results are raised to it, such as 0 for an attenuation; not above 0.
         volume_order : {"zyx", "yxz"}
             Axes of the volume.
         wait_for : sequence of cl.Event, optional
@@ -253,6 +256,7 @@ class Coverage:
             self._radius,
             self._least,
             float(scale),
+            float(lowest),
             int(slices),
             wait_for=[*(wait_for or ()), *self._last],
         )

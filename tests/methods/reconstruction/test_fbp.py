@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 import clra
 from clra.methods.reconstruction.fbp import ramp_fbp
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids, three_spheres
 from clra.ops.streaming.radiographs import Radiographs

@@ -9,6 +9,7 @@ from clra.model.sampling.ray_weights import ray_weights, widened
 from clra.model.trajectory import circular
 from clra.ops.filtering import ramp as ramp_module
 from clra.ops.filtering.ramp import RampFilter, taper
+from clra.ops.runtime.profile import CPU, GPU
 
 RELATIVE = 2e-6  # of the largest magnitude: float32 transforms
 ALIASING = 5e-4  # of kernels that go on beyond the padded line
@@ -91,8 +92,9 @@ def assert_close(found: np.ndarray, expected: np.ndarray, relative: float = RELA
     np.testing.assert_allclose(found, expected, rtol=0, atol=relative * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("shape", [(5, 13), (1, 64), (7, 37), (3, 1)])
-def test_filter_is_the_direct_convolution(context, queue, shape):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+@pytest.mark.parametrize("shape", [(5, 13), (1, 64), (7, 37), (3, 1), (2, 600)])
+def test_filter_is_the_direct_convolution(context, queue, shape, form):
     geometry = scanner(shape=shape)
     image, row_weight = image_of(geometry), np.linspace(0.5, 1, shape[0])
     view_weight = np.array([1.0, 1.75, 0.5])
@@ -111,7 +113,8 @@ def test_windows_shape_the_ramp(context, queue, window):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_filtered_radiographs_of_an_offset_detector_are_wider(context, queue, side):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_filtered_radiographs_of_an_offset_detector_are_wider(context, queue, side, form):
     """As if the rays past its near side had been measured as 0."""
     distances = {"source_to_axis": 20.0, "source_to_detector": 60.0, "pixel_size": 1.5}
     centred = circular(40, shape=(3, 37), **distances)
@@ -127,7 +130,8 @@ def test_filtered_radiographs_of_an_offset_detector_are_wider(context, queue, si
     assert_close(out.get(), filtered(centred, weighted, np.ones(3)), ALIASING)
 
 
-def test_extension_continues_truncated_rows(context, queue):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_extension_continues_truncated_rows(context, queue, form):
     geometry = scanner(shape=(3, 40))
     image = image_of(geometry)
     found = run(context, queue, geometry, image, extend=0.2)
@@ -179,7 +183,8 @@ def test_a_centred_sphere_has_its_attenuation(context, queue):
     np.testing.assert_allclose(found, attenuation, rtol=INTENSITY)
 
 
-def test_any_chunk_gives_the_same(context, queue):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_any_chunk_gives_the_same(context, queue, form):
     geometry = scanner(views=5)
     image = image_of(geometry)
     expected = run(context, queue, geometry, image)
