@@ -8,23 +8,13 @@
 // The forms for GPUs; CPUs run adjoint_columns.cl, or adjoint_tilted.cl and adjoint_steep.cl.
 // Neighbouring work-items are neighbours along x and sum VOXELS voxels along z. Where v is parallel
 // to z, a column of rays meets the voxels' plane at one q, and at rows evenly spaced along z: where
-// a ray weighs, and how much, is one multiply-add a row. Else the rays within the bounding box of a
-// voxel's support are tried one by one. Every voxel, and the one beyond, has to be in front of
-// every source.
+// a ray weighs, and how much, is one multiply-add a row; adjoint_leaning.cl does alike where v
+// leans. Else the rays within the bounding box of a voxel's support are tried one by one. Every
+// voxel, and the one beyond, has to be in front of every source.
 //
 // Global size (nx, ny, ceil(nz / VOXELS)), rounded up at will.
 
-#include "gpu.clh"
-
-#ifndef VOXELS
-#define VOXELS 8
-#endif
-#ifndef INSIDE
-#define INSIDE 0 // 2 or 4 leaves other ways out than that of so many rows, to count instructions
-#endif
-
-// Rounding must not leave out a ray that shares in a voxel; one ray too many has no weight.
-#define SLACK 1e-2f
+#include "adjoint.clh"
 
 // Global size (columns, rows, count), rounded up at will.
 kernel required_group void weigh_rays(
@@ -49,23 +39,6 @@ kernel required_group void weigh_rays(
     const size_t at = ((size_t)view * rows + r) * columns + c;
     weighed[weighed_offset + at] = projections[projections_offset + at] * share;
 }
-
-// writes a work-item's sums, of voxels `count` of which are in the volume
-always_inlined void
-put(global float *restrict target, const float *sum, const int count, const int accumulate)
-{
-#pragma unroll
-    for (int k = 0; k < VOXELS; ++k)
-        if (k < count)
-            target[k] = accumulate ? target[k] + sum[k] : sum[k];
-}
-
-// A view's rays and image.
-typedef struct {
-    global const float *view;
-    global const float *image; // (rows, columns), weighed
-    int columns, rows;
-} pencil;
 
 // What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, z) on.
 always_inlined void add_columns(
@@ -96,6 +69,7 @@ always_inlined void add_columns(
         if (INSIDE || (top >= 1.0f && bottom < rows - 3.0f && size >= 0.5f)) {
             const uint base = UNIT * ((uint)c - BIAS * (uint)COLUMNS);
             const float w1 = 1.0f - size, w2 = w1 - size;
+#define ADD(weight, n) share = fma(SATURATE(weight), PIXEL(s.image, at, n), share);
 #define TAPS(MORE)                                                                                 \
     _Pragma("unroll") for (int k = 0; k < VOXELS; ++k)                                             \
     {                                                                                              \
@@ -103,17 +77,17 @@ always_inlined void add_columns(
         const float f = row - (whole - MAGIC);                                                     \
         const uint at = WHOLE(whole) * (UNIT * COLUMNS) + base;                                    \
         float share = SATURATE(fma(-size, f, 1.0f)) * PIXEL(s.image, at, 0);                       \
-        share = fma(SATURATE(fma(size, f, w1)), PIXEL(s.image, at, COLUMNS), share);               \
+        ADD(fma(size, f, w1), COLUMNS)                                                             \
         MORE                                                                                       \
         sum[k] = fma(w, share, sum[k]);                                                            \
     }
             if (INSIDE == 2 || (INSIDE != 4 && size >= 1.0f)) {
                 TAPS()
             } else {
-                TAPS(share = fma(SATURATE(fma(-size, f, w1)), PIXEL(s.image, at, -COLUMNS), share);
-                     share = fma(SATURATE(fma(size, f, w2)), PIXEL(s.image, at, 2 * COLUMNS), share);)
+                TAPS(ADD(fma(-size, f, w1), -COLUMNS) ADD(fma(size, f, w2), 2 * COLUMNS))
             }
 #undef TAPS
+#undef ADD
         } else {
 #pragma unroll 1
             for (int k = 0; k < VOXELS; ++k) {
@@ -184,13 +158,7 @@ always_inlined float gather(
     const float row)
 {
     const int q = p == 0 ? 1 : 0, l = p == 2 ? 1 : 2, columns = s.columns;
-    // How far the projection of the square moves in which rays share in the voxel: of (a, b, g)
-    // plus any (da, db, dg), column moves by (da - column dg) / (g + dg).
-    const float depth = native_recip(g - fabs(m[8 + q]) - fabs(m[8 + l])) * (1.0f + 1e-5f);
-    const float across = fabs(fma(-column, m[8 + q], m[q])) + fabs(fma(-column, m[8 + l], m[l]));
-    const float down =
-        fabs(fma(-row, m[8 + q], m[4 + q])) + fabs(fma(-row, m[8 + l], m[4 + l]));
-    const float reach_c = fma(across, depth, SLACK), reach_r = fma(down, depth, SLACK);
+    const float reach_c = support(m, 0, q, l, g, column), reach_r = support(m, 4, q, l, g, row);
     const int left = (int)ceil(clamp(column - reach_c, 0.0f, (float)columns));
     const int right = (int)clamp(column + reach_c, -1.0f, columns - 1.0f);
     const int first = (int)ceil(clamp(row - reach_r, 0.0f, (float)s.rows));
@@ -243,10 +211,7 @@ kernel required_group void adjoint_voxels(
     const float voxel[3] = {x, y, z};
     float sum = 0.0f;
     for (int view = 0; view < count; ++view) {
-        float m[VIEW_FLOATS];
-#pragma unroll
-        for (int n = 0; n < VIEW_FLOATS; ++n)
-            m[n] = views[view * VIEW_FLOATS + n];
+        LOAD_VIEW(m, views + view * VIEW_FLOATS);
         const pencil s = {views, projections + (size_t)view * (rows * COLUMNS), columns, rows};
         const float g = AT(m + 8, x, y, z), scale = reciprocal(g);
         const float column = AT(m, x, y, z) * scale, row = AT(m + 4, x, y, z) * scale;

@@ -40,8 +40,10 @@ spline_at(const counterparts s, const int x, const int y, const real u, const fl
     *b = *p = *q = 0.0f;
     const float wy[4] = SPLINE(f, 1.0f - f), sy[4] = SPLINE_SLOPE(f, 1.0f - f);
     const real wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
+#pragma unroll
     for (int k = 0; k < 4; ++k) {
         real value = 0.0f, slope = 0.0f;
+#pragma unroll
         for (int l = 0; l < 4; ++l) {
             const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
             const real c = load_global(s.coefficients + line + k);
@@ -137,17 +139,22 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     sums += sums_offset + ((ulong)view * get_global_size(1) + block) * SUMS;
     real term[TERMS];
     real sum[SUMS];
+#pragma unroll
     for (int k = 0; k < SUMS; ++k)
         sum[k] = 0.0f;
     for (int j = start; j < stop; ++j)
         for (int i = left + get_local_id(0) * LANES; i < right; i += GROUP * LANES) {
             const real w = terms_at(s, j, i, term);
+#pragma unroll
             for (int k = 0; k < BLURS; ++k)
                 term[5 + k] = load_global(s.measured + k * s.blur + j * stride + MARGIN + i);
-            for (int k = 0, at = 0; k < TERMS; ++k) {
+#pragma unroll
+            for (int k = 0; k < TERMS; ++k) {
                 const real weighted = w * term[k];
-                for (int other = k; other < TERMS; ++other, ++at)
-                    sum[at] += weighted * term[other];
+#pragma unroll
+                for (int other = 0; other < TERMS; ++other)
+                    if (other >= k)
+                        sum[OF(k, other)] += weighted * term[other];
             }
         }
 #if GROUP == 1
@@ -156,6 +163,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
 #else
     local float shared[SUMS][GROUP + 1]; // + 1: the sums lie in different banks
     const int item = get_local_id(0);
+#pragma unroll
     for (int k = 0; k < SUMS; ++k)
         shared[k][item] = sum[k];
     barrier(CLK_LOCAL_MEM_FENCE);

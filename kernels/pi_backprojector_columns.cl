@@ -1,4 +1,4 @@
-// pi_backprojector.cl for CPUs. Back-projection over pi-intervals, for exact helical reconstruction:
+// pi_backprojector.cl for CPUs: back-projection over pi-intervals, for exact images from helices,
 // volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
 // bilinearly at the voxel's projection.
 //
@@ -26,7 +26,7 @@ static inline real inside(const real row, const float low, const float high, con
     return from_low * clamp((high - row) * per_width + 0.5f, (real)(0.0f), (real)(1.0f));
 }
 
-kernel void pi_backproject_columns(
+kernel void pi_columns(
     global float *restrict volume, // (ny, nx, nz), added to
     const ulong volume_offset,
     global const float *restrict projections, // (count, columns + 1, pitch), padded

@@ -16,9 +16,13 @@ import numpy as np
 import typer
 
 from clra.app import progress_bar
+from clra.errors import InputError
+from clra.findings import collected, collected_so_far
 
 if TYPE_CHECKING:
+    from clra.io.scanners.scanner_options import ScannerOptions
     from clra.io.scanners.scanner_scan import ScannerScan
+    from clra.model.motion import Motion
     from clra.model.scan import Scan
     from clra.progress import ProgressCallback
 
@@ -54,9 +58,12 @@ class Console:
         print(to_json(values) if self.json else text)
 
     def summary(self, values: Mapping[str, Any], text: str) -> None:
-        """Print what a command that wrote a file has to say of it, unless quiet."""
+        """Print what a command that wrote a file has to say of it, unless quiet.
+
+        As JSON it has the findings of the whole command, too.
+        """
         if self.json or not self.quiet:
-            self.result(values, text)
+            self.result({**values, "warnings": collected_so_far(outermost=True)}, text)
 
 
 @dataclass(frozen=True)
@@ -157,11 +164,27 @@ class Reading:
     def scanner(self, path: Path) -> "ScannerScan | None":
         """Read the metadata of a scanner; None of an NXtomo file."""
         from clra.io.scanners.recognise import read_scanner, recognise
+
+        return None if recognise(path) is None else read_scanner(path, self._options())
+
+    def start_motion(self, path: Path, views: int) -> "Motion | None":
+        """Read a motion of a table, or that a scanner's software measured; None of other files."""
+        from clra.io.motion_formats.motion_csv import is_motion_csv, read_motion_csv
+        from clra.io.scanners.recognise import holds_start_motion, read_start_motion
+
+        if is_motion_csv(path):
+            motion = read_motion_csv(path)[0]
+            if motion.views != views:
+                raise InputError.at(path, "view", f"{motion.views} views", f"{views} of the scan")
+            return motion
+        if not holds_start_motion(path):
+            return None
+        return read_start_motion(path, views, self._options())
+
+    def _options(self) -> "ScannerOptions":
         from clra.io.scanners.scanner_options import ScannerOptions
 
-        if recognise(path) is None:
-            return None
-        options = ScannerOptions(
+        return ScannerOptions(
             rotation=self.rotation,
             source_distance=self.source_distance,
             parallel=self.parallel,
@@ -169,7 +192,6 @@ class Reading:
             flip=self.flip,
             centre_offset=self._axis(),
         )
-        return read_scanner(path, options)
 
     def _axis(self) -> tuple[float, ...] | None:
         from clra.app.arguments import axis_place
@@ -271,12 +293,13 @@ def command(
             for key, group in groups.items():
                 values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
             if not writes:
-                function(**values)
+                with collected():
+                    function(**values)
                 return
             from clra.io.claims import one_run
 
             writing = Writing(**{f.name: values.pop(f.name) for f in fields(Writing)})
-            with one_run(overwrite=not writing.no_overwrite):
+            with one_run(overwrite=not writing.no_overwrite), collected():
                 function(**values)
 
         # typer learns a command's options from its signature and its annotations.

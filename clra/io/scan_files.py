@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.io.atomic import ensure_writable
+from clra.io.damage import reads
 from clra.io.nxtomo.fields import Overrides
 from clra.io.nxtomo.reader import read_nxtomo
 from clra.io.nxtomo.writer import write_nxtomo
@@ -23,6 +24,7 @@ from clra.model.scan import Scan
 from clra.progress import ProgressCallback
 
 
+@reads
 def read_scan(
     path: str | os.PathLike[str],
     *,

@@ -12,7 +12,7 @@ from clra.model.grid import VolumeGrid
 from clra.ops.projection.layout import view_shape
 from clra.ops.registration.gauss_newton import pair_bytes
 from clra.ops.runtime.lines import line_stride
-from clra.ops.streaming.memory import Budgets
+from clra.ops.streaming.memory import Budgets, keeps
 
 # Bytes for an element of the windows and masks in registration.
 _WINDOW = 16
@@ -85,6 +85,7 @@ def reconstruction_need(
         + filtering
         + int(4 * coarse)
         + 200 * views
+        + _resident(budgets, geometry)
         + (2 if shared else 4) * chunk
     )
     piece = min(budgets.piece, _slab(budgets, grid, volumes))
@@ -160,6 +161,7 @@ def _registering_need(
         + pair * pairs
         + _WINDOW * lined
         + (1 if shared else 2) * chunk
+        + _resident(budgets, geometry)
         + (0 if on_host else slab)
     )
     reading = _chunk(budgets, full)
@@ -179,6 +181,12 @@ def _registering_need(
 def _bytes(geometry: ConeBeamGeometry) -> int:
     """All radiographs."""
     return 4 * geometry.views * int(np.prod(geometry.shape))
+
+
+def _resident(budgets: Budgets, geometry: ConeBeamGeometry) -> int:
+    """Bytes of the radiographs that stay on the device."""
+    size = _bytes(geometry)
+    return size if keeps(budgets, (geometry.views, *geometry.shape)) else 0
 
 
 def _limited(wanted: int, budgets: Budgets, shares: int = 1) -> int:

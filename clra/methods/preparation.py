@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.findings import Finding
+from clra.model.bad_pixels import Patches
+from clra.model.corrections.air_region import AirRegion, AirStatistics
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.corrections.corrections import Corrections
 from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
-from clra.model.corrections.options import CorrectionOptions
+from clra.model.corrections.rings import ring_errors
 from clra.model.scan import Scan
 from clra.progress import ProgressCallback, tell
 
@@ -49,19 +52,39 @@ def prepared(
     options = options or CorrectionOptions()
     if scan.corrections is not None:
         return scan
-    corrections = Corrections(zingers=options.zingers)
-    if options.bad_pixels and scan.views >= FEWEST:
+    findings: list[Finding] = []
+    bad = air = rings = None
+    wanted = options.bad_pixels or options.intensity or options.rings
+    if wanted and scan.views >= FEWEST:
         statistics = DetectorStatistics(scan.geometry.shape)
-        views = sample_of_views(scan)
+        sides = AirStatistics(*scan.window)
+        views = np.arange(scan.views) if options.rings else sample_of_views(scan)
         for done, view in enumerate(views):
-            tell(progress, "looking for bad pixels", done, len(views))
-            statistics.add(scan.read(view, view + 1)[0])
-        found = statistics.find()
-        tell(progress, "looking for bad pixels", len(views), len(views))
-        for finding in bad_pixel_findings(found):
-            finding.warn()
-        if found.bad.any() and found.bad.mean() <= _MOST:
-            corrections = replace(corrections, bad=found.bad)
+            tell(progress, "looking for defects", done, len(views))
+            image = scan.read(int(view), int(view) + 1)[0]
+            statistics.add(image)
+            sides.add(image)
+        tell(progress, "looking for defects", len(views), len(views))
+        if options.bad_pixels:
+            bad, told = _usable(statistics.find())
+            findings += told
+        if options.intensity:
+            air = sides.find()
+            findings += _intensity(air)
+        if options.rings:
+            mean = statistics.moments()[0]
+            if bad is not None:
+                Patches(bad).fill(mean)
+            rings = ring_errors(mean)
+    for finding in findings:
+        finding.warn()
+    corrections = Corrections(
+        zingers=options.zingers,
+        bad=bad,
+        air=air,
+        rings=rings,
+        beam_hardening=options.beam_hardening,
+    )
     return replace(scan, corrections=corrections)
 
 
@@ -77,31 +100,31 @@ def sample_of_views(scan: Scan) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, scan.views - 1, count).round().astype(np.intp))
 
 
-def bad_pixel_findings(found: BadPixels) -> list[Finding]:
-    """Return what to tell users of bad pixels, if there are any."""
-    if not found.bad.any():
-        return []
+def _usable(found: BadPixels) -> tuple[NDArray[np.bool_] | None, list[Finding]]:
+    """Bad pixels to correct, if any, and what to tell users of them."""
+    part = float(found.bad.mean())
+    if part == 0:
+        return None, []
     measured: dict[str, float | str] = {
         "bad_pixels": int(found.bad.sum()),
         "single": found.single,
         "rows": " ".join(map(str, found.rows)),
         "columns": " ".join(map(str, found.columns)),
     }
-    if found.bad.mean() > _MOST:
-        return [
-            Finding(
-                "bad-pixels",
-                f"{found.bad.mean():.0%} of the pixels seem to show nothing of the sample",
-                "none of them is corrected: check that the radiographs are of one sample that "
-                "turns, or give a mask",
-                measured=measured,
-            )
-        ]
-    return [
-        Finding(
+    if part > _MOST:
+        finding = Finding(
             "bad-pixels",
-            f"{found}: interpolated from their neighbours",
-            severity="info",
+            f"{part:.0%} of the pixels seem to show nothing of the sample, none is corrected",
+            "check that the radiographs are of one sample that turns, or give a mask",
             measured=measured,
         )
-    ]
+        return None, [finding]
+    told = f"{found}: interpolated from their neighbours"
+    return found.bad, [Finding("bad-pixels", told, severity="info", measured=measured)]
+
+
+def _intensity(air: AirRegion | None) -> list[Finding]:
+    if air is None:
+        return []
+    told = f"the beam's intensity changes: taken from {len(air.tiles)} regions of air in each view"
+    return [Finding("intensity", told, severity="info", measured={"regions": len(air.tiles)})]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
+from clra.findings import warn
 from clra.model.corrections.corrections import Corrections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
@@ -101,7 +101,7 @@ class Scan:
             mask.flags.writeable = False
             object.__setattr__(self, "mask", mask)
         if self.corrections is not None:
-            self.corrections.check(self.shape, self.name)
+            self.corrections.check(self.geometry.shape, self.name)
 
     @property
     def views(self) -> int:
@@ -149,7 +149,7 @@ class Scan:
             self._warn_of_dark(pixels)
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
         if self._all_corrections is not None:
-            pixels = self._all_corrections.apply(pixels, start)
+            pixels = self._all_corrections.apply(pixels)
         # One such pixel would spread over the whole volume through filter and back-projection.
         finite = np.isfinite(pixels).all(axis=(1, 2))
         if not finite.all():
@@ -174,11 +174,11 @@ class Scan:
         part = (dark if self.mask is None else dark & self.mask).mean(axis=(1, 2))
         # A radiograph that is dark all over is no view of the sample, and found out elsewhere.
         if part[part < 0.5].max(initial=0) > _DARK:
-            warnings.warn(
+            warn(
+                "dark-pixels",
                 f"{self.name}: radiographs of which more than {_DARK:.0%} is dark, expected a "
                 f"transmission above {_DARKEST:g}: line integrals there are more than the "
                 f"{-np.log(_DARKEST):.3g} that they are taken as",
-                stacklevel=3,
             )
 
     @cached_property
@@ -264,7 +264,7 @@ class Scan:
             name=self.name,
             truth=None if self.truth is None else self.truth.subset(index),
             mask=self.mask,
-            corrections=None if self.corrections is None else self.corrections.subset(chosen),
+            corrections=self.corrections,
         )
 
 

@@ -36,10 +36,11 @@ def refused(done, status, *parts):
     code, out, err = done
     assert code == status, err
     assert out == ""
-    assert err.startswith("interrupted: " if status == 130 else "error: ")
-    assert err.count("\n") == 1 and err.endswith("\n")
+    *progress, line = err.splitlines()
+    assert line.startswith("interrupted: " if status == 130 else "error: ") and err.endswith("\n")
+    assert all(re.fullmatch(r".*: \d+ of \d+.*", told) for told in progress)
     for part in parts:
-        assert str(part) in err
+        assert str(part) in line
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -397,3 +398,15 @@ def test_outputs_tell_the_command_that_made_them(clra, scan_file, motion_file, r
         assert told["command"].startswith(f"clra {command} {scan_file} -o ")
         assert told["scan_checksum"] == read_scan(scan_file).checksum()
         assert told["alignment_checksum"] == record.checksum_of_motion()
+
+
+@pytest.mark.filterwarnings("default")
+def test_json_tells_what_was_warned_of(clra, record, scan_file, tmp_path):
+    path = tmp_path / "m.h5"
+    keep_motion(path, record.motion, checksum="sha256:other")
+    options = ("--motion", path, "-o", tmp_path / "c.nxs", "--json")
+    code, out, err = clra("correct", scan_file, *options)
+    assert code == 0, err
+    (told,) = json.loads(out)["warnings"]
+    assert told["code"] == "scan" and "other radiographs" in told["message"]
+    assert told["severity"] == "warning" and told["message"] in err

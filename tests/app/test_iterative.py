@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from alignments import keep_motion
 
+from clra.app.simulation import paper_like
+from clra.errors import ClraWarning
 from clra.io.alignment_file import read_alignment
-from clra.io.scan_files import read_scan
+from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import read_volume, write_volume
+from clra.methods.reconstruction.iterative import Multigrid
+from clra.methods.reconstruction.reconstruct import reconstruct
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.model.scan import Scan
 from clra.ops.streaming.stream import Stream
 from tests.app.test_cli import refused
 
@@ -150,3 +156,21 @@ def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
     monkeypatch.undo()
     assert clra(*command, "--resume", "--quiet") == (0, "", "")
     assert len(read_alignment(out).history) == 3 and not folder.exists()
+
+
+@pytest.mark.filterwarnings("default")
+def test_imgr_crops_masked_detectors_and_tells_of_truncation(clra, tmp_path):
+    geometry = paper_like("circular", 24, (24, 33))
+    wide = Ellipsoids([[0.4, 0.2, 0]], [[1.5, 1.5, 1.5]], [0.5]).line_integrals(geometry)
+    mask = np.ones(geometry.shape, np.bool_)
+    mask[:, :4] = False
+    path, out = tmp_path / "masked.nxs", tmp_path / "v.h5"
+    write_scan(path, Scan(wide, geometry, mask=mask))
+    options = ("--method", "imgr", "--levels", "HR-FR")
+    code, _, err = clra("reconstruct", path, "-o", out, *options)
+    assert code == 0 and "reaches beyond the detector" in err
+    volume, grid = read_volume(out)
+    assert grid == default_grid(read_scan(path).cropped().geometry)
+    with pytest.warns(ClraWarning, match="reaches beyond the detector"):
+        expected = reconstruct(read_scan(path), "imgr", options=Multigrid(levels="HR-FR"))
+    np.testing.assert_array_equal(volume, expected)

@@ -8,7 +8,6 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.errors import InputError
-from clra.findings import Finding
 
 
 def align(
@@ -37,8 +36,10 @@ def align(
     start: Annotated[
         Path | None,
         typer.Option(
-            metavar="MOTION.h5",
-            help="Motion to start from, of a run that was interrupted or shall be refined.",
+            metavar="MOTION",
+            help="Motion to start from: MOTION.h5 of a run that was interrupted or shall be "
+            "refined, a table as clra export-motion writes it, or what a scanner's software "
+            "measured (.txrm, .pcr, _TS.csv, CTSimU .json).",
         ),
     ] = None,
     autofocus: Annotated[
@@ -101,7 +102,6 @@ def align(
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError, keeping
-    from clra.app.plausible import doubt_of_turning
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
@@ -109,7 +109,6 @@ def align(
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
-    from clra.methods.alignment.autofocus import sharpening_by_turning_back
     from clra.methods.alignment.result import AlignmentInterrupted, finished
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.model.grid import default_grid
@@ -132,7 +131,8 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = None if start is None else read_alignment(start)
+    measured = None if start is None else reading.start_motion(start, opened.views)
+    earlier = None if start is None or measured is not None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
     about = {
@@ -159,7 +159,7 @@ def align(
                 estimate=estimate,
                 gauge=gauge,
                 reference=still,
-                motion=None if earlier is None else earlier.motion,
+                motion=measured if earlier is None else earlier.motion,
                 device=console.device,
                 progress=progress,
                 checkpoint=checkpoint,
@@ -176,20 +176,6 @@ def align(
         write_alignment(out, replace(result, volume=None))
         if volume is None:
             checkpoint.clear()
-        turned = sharpening_by_turning_back(
-            opened.cropped(),
-            result.motion.about(*opened.window_offset),
-            console.device,
-            progress=progress,
-            **limits,
-        )
-        more = {"sharpening_by_turning_back": f"{turned:.3f}"}
-        doubt = doubt_of_turning(turned)
-        doubts = [Finding("rotation", doubt)] if doubt else []
-        result = replace(
-            result, about={**result.about, **more}, warnings=(*result.warnings, *doubts)
-        )
-        write_alignment(out, replace(result, volume=None))
         errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
@@ -210,10 +196,6 @@ def align(
                 **limits,
             )
             write_report(report, findings)
-            known = {str(finding) for finding in result.warnings}
-            doubts += [Finding("report", note) for note in findings.notes if note not in known]
-    for finding in doubts:
-        finding.warn()
     values, text = summary_of(result, errors)
     beside = {"volume": volume, "report": report}
     written = {"file": out, **{name: path for name, path in beside.items() if path}}

@@ -20,7 +20,7 @@ from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Projections
-from clra.model.validation import believed_views
+from clra.model.validation import checked_valid_views
 from clra.progress import ProgressCallback, tell
 
 Views = NDArray[np.intp]
@@ -108,7 +108,7 @@ def write_nxtomo(
             raise InputError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
     if valid_views is None:
         valid_views = np.ones(geometry.views, np.bool_)
-    valid_views = believed_views(valid_views, geometry.views)
+    valid_views = checked_valid_views(valid_views, geometry.views)
     pixels = np.dtype(dtype if dtype is not None else radiographs[0:1].dtype).newbyteorder("=")
     roles = np.concatenate([np.full(part.shape[0], role, np.int32) for role, part in parts])
     views = np.flatnonzero(roles == PROJECTION)

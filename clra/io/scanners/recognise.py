@@ -149,7 +149,13 @@ def read_scanner(
     if found is None:
         return None
     each, place = found
-    return each.read(place, options or ScannerOptions())
+    try:
+        return each.read(place, options or ScannerOptions())
+    except InputError as error:
+        # What a geometry refuses does not know whence it came.
+        if str(place.parent) in str(error) or str(error).startswith("--"):
+            raise
+        raise InputError(f"{place}: {error}") from error
 
 
 def read_start_motion(
@@ -200,6 +206,13 @@ def _is_hdf5(path: Path) -> bool:
             return stream.read(8) == b"\x89HDF\r\n\x1a\n"
     except OSError:
         return True  # whoever opens it tells why it cannot be read
+
+
+def holds_start_motion(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a path is a scanner's, so that `read_start_motion` may find something there."""
+    place = Path(path)
+    alone = place.suffix.lower() == ".pcr" or place.name.lower().endswith("_ts.csv")
+    return (alone and place.is_file()) or recognise_or_none(place) is not None
 
 
 def recognise_or_none(path: Path) -> tuple[Format, Path] | None:

@@ -7,6 +7,7 @@ simulated ones come out in the frame of the measured ones, so that what registra
 is left.
 """
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -41,6 +42,8 @@ from clra.model.schedule import Stage, converged, level_name, update_size
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -168,7 +171,7 @@ class CoarseToFine:
             # A first step finds too little, see `_move`: the second may well find as much.
             previous = None if self.fresh else update_size(update_u, update_v)[0]
         if len({entry.level for entry in self.history}) == 1:
-            note = warned(lost_features(self.scan, found.correlation, stage.level))
+            note = warned(lost_features=lost_features(self.scan, found.correlation, stage.level))
             notes = filter(None, (self.history[-1].note, note))
             self.history[-1] = replace(self.history[-1], note="\n".join(notes))
 
@@ -199,10 +202,10 @@ class CoarseToFine:
         step = self.steps.step(self.motion, there)
         valid_views = np.abs(step[:2, ~self.rejected])
         if self.history:
-            note = warned(false_shifts(*self.last, level, valid_views))
+            note = warned(false_shifts=false_shifts(*self.last, level, valid_views))
             self.fresh = bool(note)
         else:
-            note = warned(far_motion(found.motion, level))
+            note = warned(out_of_reach=far_motion(found.motion, level))
             self.fresh = True
         self.last = level, valid_views
         # A first step's reconstruction was blurred, and what it registered is not all that later
@@ -222,6 +225,15 @@ class CoarseToFine:
 
     def _keep(self, stage: int, done: int) -> None:
         """Keep what the iterations so far gave: `done` of a stage."""
+        last = self.history[-1]
+        _LOG.info(
+            "%s %d: median update %.3g, %.3g pixel, correlation %.3f",
+            last.level,
+            last.iteration,
+            last.update_u_median,
+            last.update_v_median,
+            last.correlation,
+        )
         if self.checkpoint is None:
             return
         level, update = self.last

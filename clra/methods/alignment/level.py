@@ -102,7 +102,7 @@ class Level:
                 terms=self.region.terms(self.solver.terms),
                 valid_views=valid_views,
                 circle=self.solver.circle and not self.region.truncated,
-                extend=self.region.truncated,
+                beside=self.region.truncated,
                 used=self.used,
                 stage=title if doing is None else f"{title}: {doing}",
             )

@@ -8,8 +8,8 @@ import numpy as np
 from clra.errors import InputError
 from clra.methods.alignment.acceleration import Anderson
 from clra.methods.alignment.reprojection import SPREAD, is_large, registration_for
-from clra.model.angular_coverage import covered
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan
 from clra.ops.registration.gauss_newton import Registration
 from clra.ops.registration.phase_correlation import PhaseCorrelation

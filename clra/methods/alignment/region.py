@@ -63,7 +63,7 @@ def region_of(stream: Stream, scan: Scan, grid: VolumeGrid, *, own: bool = True)
         ends of a scan show something past it; a margin along z it gets in any case.
     """
     radiographs = Radiographs(stream, scan, 1)
-    cut = bool(truncated(radiographs)) and falls_outwards(radiographs)
+    cut = bool(truncated(radiographs, scan.geometry)) and falls_outwards(radiographs)
     sample = with_margin(grid)
     wide = sample
     if own and cut:

@@ -185,7 +185,7 @@ def reprojected(
     views, rows, columns = radiographs.shape
     for chunk in stream.chunks(views, radiographs.view_bytes):
         stream.report(stage, chunk.start, views)
-        measured = stream.upload(radiographs.read(chunk))
+        measured = radiographs.on_device(stream, chunk)
         simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
         project(simulated, chunk)
         yield chunk, measured, simulated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 import zlib
@@ -24,6 +25,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.streaming.volume import Volume
 
+_LOG = logging.getLogger(__name__)
 _STATE = "state.json"
 _DAMAGED = (OSError, ValueError, KeyError, TypeError)
 
@@ -146,6 +148,7 @@ class Checkpoint:
             return
         self._number, self._kept = number, kept
         self._clean(number)
+        _LOG.debug("%s keeps %s", self.folder, kept)
 
     def clear(self) -> None:
         """Remove it, if there is any."""

@@ -1,9 +1,10 @@
-"""Non-negative filtered back-projection, corrected by what its radiographs lack."""
+"""Filtered back-projection that is non-negative and fits its radiographs better."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.streaming.memory import Store
@@ -16,8 +17,8 @@ from clra.ops.streaming.volume import Volume
 # The volume and its update, on the device at a time.
 VOLUMES = 2
 # Of the corrections. Where views are few for the width of the sample, B A is more than 1 for fine
-# detail, and beyond 2 the series diverges: 77 views of 256 pixels, 2 degrees apart, ended at 0.13
-# pixel in v with a full ramp, at 0.02 with this; the paper's scans in u at 0.013 and 0.008.
+# detail, and beyond 2 the series diverges: 77 views of 256 pixels at a distance of 2 degrees ended
+# at 0.13 pixel in v with a full ramp, 0.02 with this; the paper's scans at 0.013 instead of 0.008.
 _WINDOW = "hann"
 
 
@@ -32,7 +33,7 @@ def fitted_fbp(
     used: NDArray[np.bool_],
     valid_views: NDArray[np.bool_],
     circle: bool,
-    extend: bool = False,
+    beside: bool = False,
     stage: str,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection, and correct by what the radiographs lack.
@@ -60,7 +61,7 @@ def fitted_fbp(
         Corrections, 0 for plain filtered back-projection.
     used : ndarray of bool, (rows, columns)
         Pixels that count in the corrections.
-    valid_views, circle, extend
+    valid_views, circle, beside
         As for :func:`clra.methods.reconstruction.fbp.ramp_fbp`.
     stage : str
         What progress reports call this.
@@ -72,6 +73,7 @@ def fitted_fbp(
     """
     terms = terms if positive else 0
     volumes = VOLUMES if terms else 1
+    reach = extension(radiographs, geometry, valid_views)
 
     def reconstructed(measured: Radiographs, onto: Volume | None, doing: str) -> Volume:
         return ramp_fbp(
@@ -81,7 +83,8 @@ def fitted_fbp(
             grid,
             valid_views=valid_views,
             circle=circle,
-            extend=extend,
+            beside=beside,
+            extend=reach,
             positive=positive and onto is None,
             window="ram-lak" if onto is None else _WINDOW,
             volumes=volumes,

@@ -268,7 +268,7 @@ class _Run:
             found.residual,
             step.seconds,
             misfit=step.misfit,
-            note=warned(far, lost),
+            note=warned(out_of_reach=far, lost_features=lost),
             **errors,
         )
         return (*self.done.history, iteration)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.model.bad_pixels import Patches
+from clra.model.corrections.air_region import AirRegion
 from clra.model.corrections.zingers import replace_zingers
 
 Floats = NDArray[np.float32]
@@ -21,8 +21,8 @@ Mask = NDArray[np.bool_]
 class Corrections:
     """Corrections of line integrals p of a scan, in the order in which they are made.
 
-    Zingers are replaced, bad pixels interpolated, ``offset`` of the view and ``rings`` of the pixel
-    subtracted, and beam hardening undone by ``p + c1 p^2 + c2 p^3 + ...``.
+    Bad pixels are interpolated, zingers replaced, the line integral of the air in the view and the
+    error of the pixel subtracted, and beam hardening undone by ``p + c1 p^2 + c2 p^3 + ...``.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ class Corrections:
         Replace single pixels that are far brighter than all around them.
     bad : ndarray of bool, (rows, columns), optional
         True where a pixel does not show the sample.
-    offset : ndarray, (views,), optional
-        Line integral of the air: what the beam lost against the flat field.
+    air : AirRegion, optional
+        Where the detector looks past the sample: what the beam lost against the flat field.
     rings : ndarray, (rows, columns), optional
         Error of each pixel that is the same in all views.
     beam_hardening : tuple of float
@@ -40,30 +40,28 @@ class Corrections:
 
     zingers: bool = False
     bad: Mask | None = None
-    offset: NDArray[np.float64] | None = None
+    air: AirRegion | None = None
     rings: Floats | None = None
     beam_hardening: tuple[float, ...] = ()
 
-    def check(self, shape: tuple[int, int, int], name: str) -> None:
-        """Raise an InputError if an array does not fit a scan of (views, rows, columns)."""
-        for field, expected in (("bad", shape[1:]), ("offset", shape[:1]), ("rings", shape[1:])):
+    def check(self, shape: tuple[int, int], name: str) -> None:
+        """Raise an InputError if an array does not fit a detector of (rows, columns)."""
+        for field in ("bad", "rings"):
             values = getattr(self, field)
-            if values is not None and values.shape != expected:
+            if values is not None and values.shape != shape:
                 raise InputError(
-                    f"{name}: corrections.{field}: found shape {values.shape}, expected {expected}"
+                    f"{name}: corrections.{field}: found shape {values.shape}, expected {shape}"
                 )
         if self.bad is not None and self.bad.all():
             raise InputError(f"{name}: corrections.bad: found no good pixel, expected some")
 
-    def apply(self, pixels: Floats, start: int) -> Floats:
+    def apply(self, pixels: Floats) -> Floats:
         """Correct line integrals.
 
         Parameters
         ----------
         pixels : ndarray of float32, (n, rows, columns)
-            Of consecutive views; left as they are.
-        start : int
-            The first view's number.
+            Left as they are.
 
         Returns
         -------
@@ -71,13 +69,13 @@ class Corrections:
         """
         pixels = pixels.copy()
         patches = self._patches
-        for view, image in enumerate(pixels, start):
+        for image in pixels:
             if patches is not None:
                 patches.fill(image)
             if self.zingers:
                 replace_zingers(image)
-            if self.offset is not None:
-                image -= np.float32(self.offset[view])
+            if self.air is not None:
+                image -= np.float32(self.air.level(image))
             if self.rings is not None:
                 image -= self.rings
             if self.beam_hardening:
@@ -102,13 +100,9 @@ class Corrections:
         return replace(
             self,
             bad=None if self.bad is None else self.bad[rows, columns],
+            air=None if self.air is None else self.air.cropped(rows, columns),
             rings=None if self.rings is None else self.rings[rows, columns],
         )
-
-    def subset(self, index: slice | ArrayLike) -> Corrections:
-        """Return those of some of the views."""
-        chosen: Any = index
-        return self if self.offset is None else replace(self, offset=self.offset[chosen])
 
     @cached_property
     def _patches(self) -> Patches | None:

@@ -26,6 +26,10 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # Neighbours lie at once and twice these distances on both sides. One of the four may be bad as
 # well: so squares of 3 x 3 bad pixels, and three dead lines side by side, are found.
 _NEAR = (1, 2)
+# Fewer columns, or rows, do not tell which of them are dead: scans of two rows are no rarity.
+_FEWEST = 12
+# Below so many rows or columns a sample's details are no wider than a bad pixel.
+_SMALL = 40
 # Chance at which a good pixel is called insensitive or standing out because of noise alone.
 _CHANCE = 1e-10
 # A pixel's variance is this part of its neighbours', at most, if it is insensitive: samples with
@@ -41,10 +45,15 @@ _CONTRAST, _USUAL = 0.1, 6.0
 _EXTREME = 10.0
 # Variances beside a border that differ by less than this factor are alike.
 _ALIKE = 0.4
+# The lowest variance of a detector, but for this part of its pixels, is that of the noise. What
+# varies by less than the other part of it is constant.
+_FLOOR, _CONSTANT = 0.04, 1e-3
 # Part of a line, of all that varies beside it, that is insensitive if it is dead.
 _LINE = 0.6
 # Few views, in which no neighbour may vary as little as a pixel that is insensitive.
 _FEW = 15
+# Standard deviation, for that of the mean image, below which a pixel counts as constant.
+_ROUNDING = 1e-4
 # Fewest views that tell anything.
 FEWEST = 5
 
@@ -128,8 +137,9 @@ class DetectorStatistics:
         count = self.views - 2
         mean = (self._sum - low - high) / count
         square = (self._squares - low**2 - high**2) / count - mean**2
-        # What rounding leaves of a constant is not a variance.
-        rounding = 1e-12 * (self._squares / self.views)
+        # What rounding leaves of a constant is not a variance, nor is anything so far below what
+        # the image itself spans: a simulation of a round sample that stands still.
+        rounding = np.maximum(1e-12 * (self._squares / self.views), _ROUNDING**2 * mean.var())
         variance = np.where(square > rounding, square, 0) * count / (count - 1)
         return mean.astype(np.float32), variance.astype(np.float32)
 
@@ -144,6 +154,8 @@ class DetectorStatistics:
         known[rows], known[:, columns] = True, True
         # Beside a dead line pixels are compared with what lies beyond it.
         mean, variance = _filled(mean, rows, columns), _filled(variance, rows, columns)
+        if min(mean.shape) < _SMALL:
+            return BadPixels(known, rows, columns)
         bad = known | self._insensitive(variance) | self._standing_out(mean, variance)
         return BadPixels(bad, rows, columns)
 
@@ -189,6 +201,8 @@ class DetectorStatistics:
     def _dead_lines(self, mean: Floats, variance: Floats) -> NDArray[np.intp]:
         """Columns that show nothing of what lies beside them; up to three side by side."""
         rows, columns = variance.shape
+        if columns < _FEWEST:
+            return np.zeros(0, np.intp)
         least = _EXTREME * self._least_excess(mean, variance)
         best = np.zeros(columns)
         for distance in _NEAR:
@@ -201,20 +215,29 @@ class DetectorStatistics:
             part = np.maximum(part, np.abs(extreme.sum(axis=0)) / rows)
             best[inside] = np.maximum(best, part)[inside]
         for border in (slice(None), slice(None, None, -1)):
-            best[border][:4] = np.maximum(best[border][:4], self._at_border(variance[:, border]))
+            best[border][:4] = np.maximum(
+                best[border][:4], self._at_border(mean[:, border], variance[:, border])
+            )
         return np.flatnonzero(best > _LINE)
 
-    def _at_border(self, variance: Floats) -> NDArray[np.float64]:
-        """Part of each of the first columns that is insensitive, beside columns that are alike."""
+    def _at_border(self, mean: Floats, variance: Floats) -> NDArray[np.float64]:
+        """Part of each of the first columns that is insensitive, for what lies inside of it."""
         part = np.zeros(4)
         profile = variance[:, :12].mean(axis=0)
+        floor = np.quantile(variance, _FLOOR)
         for column in range(min(3, len(profile) - 4)):
             beside = profile[column + 1 : column + 5]
-            # Where the sample only just reaches, the variance falls toward the border by itself.
-            if beside.min() > _ALIKE * beside.max():
-                lowest = np.sort(variance[:, column + 1 : column + 5], axis=1)[:, 1]
-                lacking = variance[:, column] < self._least * lowest
-                part[: column + 1] = lacking.sum() / max((lowest > 0).sum(), len(variance) / 8)
+            lowest = np.sort(variance[:, column + 1 : column + 5], axis=1)[:, 1]
+            # Where the sample only just reaches, the variance falls toward the border by itself,
+            # but not far below that of the noise; and what looks like air there does no harm.
+            rim = beside.min() <= _ALIKE * beside.max()
+            if rim:
+                lowest = np.minimum(lowest, _CONSTANT * floor)
+            lacking = variance[:, column] < self._least * lowest
+            if rim:
+                lacking &= abs(mean[:, column]) > self._least_excess(mean, variance)
+            dead = lacking.sum() / max((lowest > 0).sum(), len(variance) / 8)
+            part[: column + 1] = np.maximum(part[: column + 1], dead)
         return part
 
     @property
@@ -251,7 +274,8 @@ def _excess(mean: Floats, step: tuple[int, int], distance: int) -> tuple[Floats,
     above, below = mean - near[2], near[1] - mean
     return (
         np.maximum(above, below),
-        near[2] - near[1],
+        # Of three of them: two may be alike by chance, such as on either side of a round sample.
+        np.minimum(near[3] - near[1], near[2] - near[0]),
         np.where(above > below, np.float32(1), np.float32(-1)),
     )
 

@@ -15,7 +15,9 @@ from clra.ops.runtime.kernel import Step
 _GROUP = (32, 8, 1)
 # Rays, and voxels along z, that a work-item treats where v is parallel to z, and voxels otherwise.
 # More share more, and take registers: see tools/check_gpu.py.
-_RAYS, _VOXELS, _ADJOINT_VOXELS = 4, 16, 16
+_RAYS, _VOXELS = 4, 16
+# Of the adjoint's kernels: axial, leaning and for any pose.
+_ADJOINT_VOXELS = {"adjoint_axial": 16, "adjoint_leaning": 8, "adjoint_voxels": 1}
 # Voxel-views of one launch: about a second on a slow GPU, whose display must not freeze.
 _MOST_WORK = 8e9
 # Views of one launch where together they see more than this many times the height that one does,
@@ -193,24 +195,26 @@ class GpuAdjoint:
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        self._weigh = self._built("weigh_rays", {})
-        self._prepared = self._step
+        self._steps: dict[str, Step] = {}
+        self._weigh = self._built("weigh_rays")
+        self._built(self._kernel)
 
-    @cached_property
-    def _axial(self) -> Step:
-        return self._built("adjoint_axial", {"VOXELS": _ADJOINT_VOXELS})
-
-    @cached_property
-    def _voxels(self) -> Step:
-        return self._built("adjoint_voxels", {})
-
-    def _built(self, kernel: str, defines: dict[str, object]) -> Step:
-        defines = {**size_constants(self._layout), **defines}
-        return Step(self._layout.context, "adjoint.cl", kernel, _GROUP, defines)
+    def _built(self, kernel: str) -> Step:
+        """Build what is needed, when it is."""
+        if kernel not in self._steps:
+            voxels = _ADJOINT_VOXELS.get(kernel, 1)
+            defines = {**size_constants(self._layout), "VOXELS": voxels}
+            context = self._layout.context
+            file = "adjoint_leaning.cl" if kernel == "adjoint_leaning" else "adjoint.cl"
+            self._steps[kernel] = Step(context, file, kernel, _GROUP, defines)
+        return self._steps[kernel]
 
     @property
-    def _step(self) -> Step:
-        return self._axial if self._layout.columnar else self._voxels
+    def _kernel(self) -> str:
+        layout = self._layout
+        if layout.columnar:
+            return "adjoint_axial"
+        return "adjoint_leaning" if layout.leaning else "adjoint_voxels"
 
     def __call__(
         self,
@@ -225,7 +229,7 @@ class GpuAdjoint:
         layout = self._layout
         nx, ny, nz = layout.sizes
         columns, rows, _ = layout.detector
-        voxels = _ADJOINT_VOXELS if layout.columnar else 1
+        gather, voxels = self._built(self._kernel), _ADJOINT_VOXELS[self._kernel]
         for first, last in layout.batches(views.stop - views.start):
             part = slice(views.start + first, views.start + last)
             weighed = layout.scratch_projections(last - first)
@@ -242,7 +246,7 @@ class GpuAdjoint:
                 wait_for=wait_for,
             )
             for run in runs(layout, part):
-                event = self._step(
+                event = gather(
                     queue,
                     (nx, ny, -(-nz // voxels)),
                     volume,

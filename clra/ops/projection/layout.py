@@ -54,6 +54,8 @@ class Layout:
         Its ``projector_lanes``.
     columnar : bool
         Whether the kernels for v parallel to z apply, where besides no ray is steep.
+    leaning : bool
+        Whether no ray is steep and v is within 45 degrees of z.
     heights : ndarray
         (views, 2) voxels along z that each view sees: the first, and one past the last.
     steep : bool
@@ -111,6 +113,7 @@ class Layout:
         self.table = to_device(self.context, view_table(geometry, self.grid))
         self.steep = _steep(geometry)
         self.columnar = self.profile.columns and geometry.axial and not self.steep
+        self.leaning = not self.steep and _leaning(geometry)
         self.heights = heights(geometry, self.grid)
 
     def check(
@@ -269,6 +272,12 @@ def heights(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.int64]:
     low = np.clip(np.floor(at.min(axis=(1, 2))), 0, nz)
     high = np.clip(np.ceil(at.max(axis=(1, 2))) + 1, 0, nz)
     return np.stack([low, high], axis=1).astype(np.int64)
+
+
+def _leaning(geometry: ConeBeamGeometry) -> bool:
+    """Whether every view's rows follow each other within 45 degrees of z."""
+    level = np.linalg.norm(geometry.v[:, :2], axis=1)
+    return bool(np.all(np.abs(geometry.v[:, 2]) > level))
 
 
 def _steep(geometry: ConeBeamGeometry) -> bool:

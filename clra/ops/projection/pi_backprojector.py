@@ -86,7 +86,7 @@ class PiBackProjector:
         self.scratch_bytes = self._layout.scratch_bytes
         if self._layout.profile.on_cpu:
             defines = {"LANES": self._layout.lanes, "BLOCK": _VOXELS}
-            file, kernel = "pi_backprojector_columns.cl", "pi_backproject_columns"
+            file, kernel = "pi_backprojector_columns.cl", "pi_columns"
             self._step = Step(context, file, kernel, (1, 1, 1), defines)
         else:
             constants = {**size_constants(self._layout), "VOXELS": _GPU_VOXELS}

@@ -93,11 +93,17 @@ def work_group_size(
     return tuple(sizes)
 
 
-def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
+def group(
+    context: cl.Context,
+    file: str,
+    function: str,
+    wanted: int,
+    defines: Mapping[str, object] | None = None,
+) -> int:
     """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
     size = min(wanted, profile_of(context).reduction_group)
     while size > 1:
-        kernel = builds(context).kernel(file, function, {"GROUP": size})
+        kernel = builds(context).kernel(file, function, {**(defines or {}), "GROUP": size})
         if all(work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
             break
         size //= 2

@@ -1,6 +1,8 @@
 """Keys that are missing or broken: one line with file, field, what was found and expected."""
 
 import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -9,7 +11,7 @@ import pytest
 import tifffile
 import vendor_files as vendor
 
-from clra.errors import InputError
+from clra.errors import ClraWarning, InputError
 from clra.io.key_value_text import KeyValueText
 from clra.io.scan_files import import_scanner, read_scan
 from clra.io.scanners.recognise import read_scanner
@@ -25,7 +27,7 @@ TEXTS = {
     "heliscan": (vendor.write_heliscan, ("camera_length", "pixel_size_x")),
 }  # fmt: skip
 CASES = [(name, key) for name, (_, keys) in TEXTS.items() for key in keys if key[:3] != "SCO"]
-TABLES = {"angles": np.arange(24.0), "shape": vendor.SHAPE}
+TABLES = {"angles": np.arange(24.0), "shape": vendor.SHAPE, "z_translation": np.zeros(24)}
 
 
 def options(name: str) -> ScannerOptions:
@@ -70,6 +72,20 @@ def test_distances_of_nothing(name: str, tmp_path: Path) -> None:
         read_scanner(path, options(name))
 
 
+def test_a_detector_before_the_axis(tmp_path: Path) -> None:
+    path = vendor.write_nikon(tmp_path, None)
+    edited(path, "SrcToDetector", "20.0")
+    with pytest.raises(InputError, match="distances: found 30 mm to the axis, 20 mm to the detec"):
+        read_scanner(path)
+
+
+def test_what_a_geometry_refuses_names_the_file(tmp_path: Path) -> None:
+    path = vendor.write_geom(tmp_path, None, np.zeros((vendor.VIEWS, 12)))
+    with pytest.raises(InputError) as refused:
+        read_scanner(path, ScannerOptions(shape=vendor.SHAPE))
+    assert str(refused.value).startswith(f"{path}: u and v: parallel or zero in view 0, expected")
+
+
 def test_no_radiographs_beside_the_metadata(tmp_path: Path) -> None:
     path = vendor.write_nikon(tmp_path, None)
     scan = read_scan(path)
@@ -81,15 +97,51 @@ def test_no_radiographs_beside_the_metadata(tmp_path: Path) -> None:
     assert not (tmp_path / "scan.nxs").exists()
 
 
+def test_threads_read_frames_of_many_files(tmp_path: Path) -> None:
+    levels = np.linspace(0.1, 0.9, vendor.VIEWS)[:, None, None]
+    path = vendor.write_skyscan(tmp_path, np.broadcast_to(levels, (vendor.VIEWS, *vendor.SHAPE)))
+    projections = read_scan(path).projections
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: projections[k : k + 1][0, 3, 5], list(range(24)) * 8))
+    np.testing.assert_allclose(found, np.tile(levels.ravel(), 8), atol=2e-5)
+
+
 def test_frames_that_do_not_fit(tmp_path: Path) -> None:
     frames = np.full((vendor.VIEWS, *vendor.SHAPE), 0.5)
     path = vendor.write_skyscan(tmp_path, frames)
-    (tmp_path / "bone_0007.tif").unlink()
-    with pytest.raises(InputError, match="found 23 frames of 22 x 30, expected 24 of 22 x 30"):
+    tifffile.imwrite(tmp_path / "bone_0024.tif", np.zeros(vendor.SHAPE, np.uint16))
+    with pytest.raises(InputError, match="found 25 frames of 22 x 30, expected 24 of 22 x 30"):
         read_scan(path)
+    (tmp_path / "bone_0024.tif").unlink()
     tifffile.imwrite(tmp_path / "bone_0007.tif", np.zeros((3, 4), np.uint16))
     with pytest.raises(InputError, match=r"bone_0007\.tif: frame: found \(3, 4\)"):
         read_scan(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (vendor.write_nikon, "Lego_{:04d}.tif"), (vendor.write_skyscan, "bone_{:04d}.tif"),
+        (vendor.write_phoenix, "fly{:04d}.tif"), (vendor.write_tescan, "scan_{:06d}.tif"),
+    ],
+)  # fmt: skip
+def test_what_is_left_of_a_scan_keeps_its_angles(
+    write: Callable[..., Path], name: str, tmp_path: Path
+) -> None:
+    levels = np.linspace(0.1, 0.9, vendor.VIEWS)[:, None, None]
+    path = write(tmp_path, np.broadcast_to(levels, (vendor.VIEWS, *vendor.SHAPE)))
+    whole = read_scan(path)
+    first = int(not (tmp_path / name.format(0)).exists())
+    lost = [3, 21, 22, 23]
+    for view in lost:
+        (tmp_path / name.format(view + first)).unlink()
+    numbers = ", ".join(str(view + first) for view in lost)
+    with pytest.warns(ClraWarning, match=rf"4 of 24 radiographs are missing: numbers {numbers}:"):
+        rest = read_scan(path)
+    left = np.setdiff1d(np.arange(vendor.VIEWS), lost)
+    assert rest.geometry == whole.geometry.subset(left)
+    found = rest.projections[0 : len(left)][:, 4, 5]
+    np.testing.assert_allclose(found, levels.ravel()[left], atol=2e-5)
 
 
 def test_tables_that_are_too_short(tmp_path: Path) -> None:
@@ -106,10 +158,11 @@ def test_tables_that_are_too_short(tmp_path: Path) -> None:
 
 def test_data_exchange_needs_distances_and_frames(tmp_path: Path) -> None:
     path = vendor.write_dxchange(tmp_path, None)
-    with pytest.raises(InputError, match=r"pixel size: found none, expected --pixel-size MM"):
-        read_scan(path)
     with pytest.raises(InputError, match=r"distances: found none.*--parallel, or in clra import"):
-        read_scan(path, options=ScannerOptions(pixel_size=0.1))
+        read_scan(path)
+    near = ScannerOptions(source_distance=30, detector_distance=90)
+    with pytest.raises(InputError, match=r"pixel size: found none, expected --pixel-size MM"):
+        read_scan(path, options=near)
     with h5py.File(path, "r+") as file:
         del file["exchange/theta"]
         file["exchange/theta"] = np.arange(5.0)
@@ -124,8 +177,23 @@ def test_data_exchange_needs_distances_and_frames(tmp_path: Path) -> None:
 
 def test_heliscan_has_no_angles_of_its_own(tmp_path: Path) -> None:
     path = vendor.write_heliscan(tmp_path, np.full((vendor.VIEWS, *vendor.SHAPE), 0.5))
-    with pytest.raises(InputError, match="angles: found none, expected --angles FILE"):
-        read_scan(path)
+    still = {"z_translation": np.zeros(vendor.VIEWS)}
+    scan = read_scanner(path, ScannerOptions(shape=vendor.SHAPE, **still))
+    assert scan.geometry.views == vendor.VIEWS  # described it can be
+    with (
+        pytest.warns(ClraWarning, match="angles are not in this format: a turn is drawn"),
+        pytest.raises(InputError, match="angles: found none in this format, expected --angles"),
+    ):
+        scan.scan().read(0, 1)
+    with pytest.raises(InputError, match="angles: found none in this format, expected --angles"):
+        import_scanner(tmp_path / "scan.nxs", scan)
+    whole = path.read_text()
+    path.write_text(f"{whole}detector_size_x 30\ndetector_size_y 22\nviews 660\nsections_y 1\n")
+    with pytest.raises(InputError, match="found 660 pixels a frame, expected --shape"):
+        read_scan(path)  # 22 x 30 or 1 x 660
+    path.write_text(f"{whole}detector_size_x 30\ndetector_size_y 22\n")
+    assert read_scanner(path).geometry.shape == vendor.SHAPE
+    path.write_text(whole)
     with pytest.raises(
         InputError, match="rows and columns: found 660 pixels a frame, expected --sh"
     ):
@@ -183,3 +251,49 @@ def test_numbers_as_scanners_write_them(value: str, number: float, tmp_path: Pat
     path.write_bytes(b"[A]\nkey=\xb5m\n")
     with pytest.raises(InputError, match=r"\[A\] key: found 'µm', expected a number"):
         KeyValueText.read(path).number("key", section="A")
+
+
+WRITERS = {
+    **{name: write for name, (write, _) in TEXTS.items()},
+    "dxchange": vendor.write_dxchange,
+    "zeiss": vendor.write_zeiss,
+    "ctsimu": vendor.write_ctsimu,
+}
+PIECES = (b"-", b"1e9", b"0", b"\n", b"=", b"nan", b"[", b'"', b",", b"null", b"e")
+
+
+def damaged(whole: bytes, random: np.random.Generator) -> bytes:
+    """A few bytes changed, lost or put in; or the end lost."""
+    for _ in range(random.integers(1, 4)):
+        place, kind = int(random.integers(len(whole))), random.integers(4)
+        if kind == 0:
+            whole = whole[:place] + bytes([random.integers(256)]) + whole[place + 1 :]
+        elif kind == 1:
+            whole = whole[:place] + whole[place + int(random.integers(1, 30)) :]
+        elif kind == 2:
+            whole = whole[:place] + PIECES[random.integers(len(PIECES))] + whole[place:]
+        else:
+            whole = whole[:place]
+        whole = whole or b"x"
+    return whole
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damage_of_any_kind_is_the_files_fault(name: str, tmp_path: Path) -> None:
+    if name == "zeiss":
+        pytest.importorskip("olefile")
+    path = WRITERS[name](tmp_path, None)
+    kept = {file: file.read_bytes() for file in sorted(tmp_path.rglob("*")) if file.is_file()}
+    random = np.random.default_rng(0)
+    given = {"parallel": True} if name == "dxchange" else {}
+    given |= TABLES if name == "heliscan" else {}
+    for _ in range(60):
+        file = list(kept)[random.integers(len(kept))]
+        file.write_bytes(damaged(kept[file], random))
+        try:
+            scan = read_scanner(path, ScannerOptions(**given))
+            if scan is not None and not scan.missing:
+                np.asarray(scan.frames[0:2])
+        except InputError as error:
+            assert "\n" not in str(error)
+        file.write_bytes(kept[file])

@@ -58,7 +58,11 @@ LAYOUTS = {
         DEGREES,
         options={"source_distance": NEAR, "detector_distance": FAR - NEAR, "pixel_size": PIXEL},
     ),
-    "heliscan": Layout(vendor.write_heliscan, DEGREES, options={"angles": DEGREES, "shape": SHAPE}),
+    "heliscan": Layout(
+        vendor.write_heliscan,
+        DEGREES,
+        options={"angles": DEGREES, "shape": SHAPE, "z_translation": 0 * DEGREES},
+    ),
     # The stage's u, the sample's x, points along the beam: a quarter of a turn behind.
     "ctsimu": Layout(vendor.write_ctsimu, 15.0 * np.arange(VIEWS) + 90.0),
     "geom": Layout(

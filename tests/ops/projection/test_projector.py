@@ -123,7 +123,10 @@ def test_volumes_of_any_shape(queue, shape, form):
 
 
 @pytest.mark.parametrize(
-    "form", [FORMS["tilted"], NARROW["narrow tilted"]], ids=["", "narrow"], indirect=True
+    "form",
+    [FORMS["tilted"], NARROW["narrow tilted"], FORMS["gpu tilted"]],
+    ids=["", "narrow", "gpu"],
+    indirect=True,
 )
 @pytest.mark.parametrize("pixel", [0.4, 0.9, 1.6])
 @pytest.mark.parametrize("roll, pitch", [(0, 15), (2, 0), (12, -5), (40, 0), (181, 1)])

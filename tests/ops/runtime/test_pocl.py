@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from clra.errors import ClraWarning
-from clra.ops.runtime import pocl
+from clra.ops.runtime import devices, pocl
 
 # What /proc/cpuinfo says of a CPU for which PoCL chooses each variant, without what plays no part.
 SSE = "sse sse2 pni cx16"
@@ -204,16 +204,17 @@ def test_where_it_cannot_be_paired_it_says_what_to_install(monkeypatch):
         assert pocl.build_options([strange]) == []
 
 
-def test_the_real_record_is_paired(context):
-    real = context.devices[0]
-    if not pocl.needs_pairing(real):
-        pytest.skip(f"{real.platform.version} needs no pairing")
-    (option,) = pocl.build_options(context.devices)
+def test_the_real_record_is_paired():
     name = pocl.cpu_of_variant(pocl.cpu_flags())
-    assert option == f"-DCLRA_POCL_CPU={name}"
-    # The name is found again as the word after the triple.
-    words = (ctypes.c_void_p * 256).from_address(real.int_ptr)
-    memory = pocl._Memory.of_process()
-    texts = [memory.text(word) for word in words]
-    place = next(i for i, text in enumerate(texts) if re.fullmatch(rb"x86_64-.*", text))
-    assert texts[place + 1].decode() == name
+    listed = [devices.device_at(info.index) for info in devices.devices()]
+    old = [device for device in listed if pocl.needs_pairing(device)]
+    if not old:
+        pytest.skip("no PoCL before 5.0 whose built-ins come in variants")
+    for real in old:
+        assert pocl.build_options([real]) == [f"-DCLRA_POCL_CPU={name}"]
+        # The name is found again as the word after the triple, or after Debian's variant.
+        words = (ctypes.c_void_p * 256).from_address(real.int_ptr)
+        memory = pocl._Memory.of_process()
+        texts = [memory.text(word).decode(errors="replace") for word in words]
+        place = next(i for i, text in enumerate(texts) if re.fullmatch(r"x86_64-.*", text))
+        assert name in texts[place + 1 : place + 3]
