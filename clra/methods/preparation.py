@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.findings import Finding
 from clra.model.bad_pixels import Patches
 from clra.model.corrections.air_region import AirRegion, AirStatistics
@@ -15,6 +16,7 @@ from clra.model.corrections.corrections import Corrections
 from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
 from clra.model.corrections.rings import ring_errors
 from clra.model.scan import Scan
+from clra.model.validation import checked_valid_views
 from clra.progress import ProgressCallback, tell
 
 # Views that the detector's pixels are judged by: 60 tell a hot pixel from photon noise, and of
@@ -51,7 +53,15 @@ def prepared(
     """
     options = options or CorrectionOptions()
     if scan.corrections is not None:
+        for finding in scan.corrections.findings:
+            finding.warn()
         return scan
+    outside = [view for view in options.exclude if not 0 <= view < scan.views]
+    if outside or len(set(options.exclude)) >= scan.views:
+        found = f"view {outside[0]}" if outside else "all views"
+        raise InputError(
+            f"{scan.name}: exclude: found {found}, expected some of {scan.views} views"
+        )
     findings: list[Finding] = []
     bad = air = rings = None
     wanted = options.bad_pixels or options.intensity or options.rings
@@ -59,6 +69,7 @@ def prepared(
         statistics = DetectorStatistics(scan.geometry.shape)
         sides = AirStatistics(*scan.window)
         views = np.arange(scan.views) if options.rings else sample_of_views(scan)
+        views = np.setdiff1d(views, options.exclude)
         for done, view in enumerate(views):
             tell(progress, "looking for defects", done, len(views))
             image = scan.read(int(view), int(view) + 1)[0]
@@ -84,6 +95,8 @@ def prepared(
         air=air,
         rings=rings,
         beam_hardening=options.beam_hardening,
+        excluded=options.exclude,
+        findings=tuple(findings),
     )
     return replace(scan, corrections=corrections)
 
@@ -91,6 +104,16 @@ def prepared(
 def with_detector_of(scan: Scan, other: Scan) -> Scan:
     """Return another scan by the same detector with the scan's mask, bad pixels and rings."""
     return replace(other, mask=scan.mask, corrections=scan.corrections)
+
+
+def used_views(scan: Scan, valid: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Return which views to use, (views,): those that are valid and not excluded; None for all."""
+    excluded = () if scan.corrections is None else scan.corrections.excluded
+    if not excluded:
+        return valid
+    used = np.ones(scan.views, np.bool_) if valid is None else valid.copy()
+    used[list(excluded)] = False
+    return checked_valid_views(used, scan.views)
 
 
 def sample_of_views(scan: Scan) -> NDArray[np.intp]:
