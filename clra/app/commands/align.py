@@ -8,7 +8,6 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.errors import InputError
-from clra.findings import Finding
 
 
 def align(
@@ -102,7 +101,6 @@ def align(
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError, keeping
-    from clra.app.plausible import doubt_of_turning
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
@@ -110,7 +108,6 @@ def align(
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
-    from clra.methods.alignment.autofocus import sharpening_by_turning_back
     from clra.methods.alignment.result import AlignmentInterrupted, finished
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.model.grid import default_grid
@@ -178,20 +175,6 @@ def align(
         write_alignment(out, replace(result, volume=None))
         if volume is None:
             checkpoint.clear()
-        turned = sharpening_by_turning_back(
-            opened.cropped(),
-            result.motion.about(*opened.window_offset),
-            console.device,
-            progress=progress,
-            **limits,
-        )
-        more = {"sharpening_by_turning_back": f"{turned:.3f}"}
-        doubt = doubt_of_turning(turned)
-        doubts = [Finding("rotation", doubt)] if doubt else []
-        result = replace(
-            result, about={**result.about, **more}, warnings=(*result.warnings, *doubts)
-        )
-        write_alignment(out, replace(result, volume=None))
         errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
@@ -212,10 +195,6 @@ def align(
                 **limits,
             )
             write_report(report, findings)
-            known = {str(finding) for finding in result.warnings}
-            doubts += [Finding("report", note) for note in findings.notes if note not in known]
-    for finding in doubts:
-        finding.warn()
     values, text = summary_of(result, errors)
     beside = {"volume": volume, "report": report}
     written = {"file": out, **{name: path for name, path in beside.items() if path}}

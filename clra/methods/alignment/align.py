@@ -4,15 +4,18 @@ import os
 from dataclasses import replace
 from typing import Any
 
-from clra.errors import InputError
-from clra.findings import collected
+from clra.errors import Cancelled, InputError
+from clra.findings import Finding, collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.quality import assess
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
 from clra.methods.preparation import prepared, with_detector_of
+from clra.methods.radiograph_checks import refuse_counts
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.model.corrections.correction_options import CorrectionOptions
@@ -21,12 +24,15 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
 from clra.ops.runtime.versions import versions
+from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
 METHODS = ("ra", "imgr", "reference")
 ESTIMATES = ("shift", "shift+scale", "source")
 GAUGES = ("anchored", "free")
+# Valid views below which none can be held out.
+_ENOUGH_TO_JUDGE = 4
 
 
 def align(
@@ -48,6 +54,7 @@ def align(
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
     corrections: CorrectionOptions | None = None,
+    quality: bool = True,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -97,6 +104,9 @@ def align(
         Bytes that may be used.
     corrections : CorrectionOptions, optional
         Defects of the radiographs to look for and correct first; by default the defaults of these.
+    quality : bool
+        Whether to judge the result by views that are held out: a verdict, and standard errors that
+        count what is left. A motion that predicts them no better than the start is not returned.
 
     Returns
     -------
@@ -156,6 +166,7 @@ def align(
         )
 
     scale = estimate != "shift"
+    refuse_counts(scan)
     with collected() as findings:
         scan = prepared(scan, corrections, progress=progress)
         # What the mask leaves of the detector is aligned as a detector of its own.
@@ -212,10 +223,27 @@ def align(
                 aligned = run.result()
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
+        if quality and not cancelled(findings):
+            aligned, told_of = _judged(stream, part, aligned, start, scale)
+            findings += told_of
         result = told(aligned)
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()
     return result
+
+
+def _judged(
+    stream: Stream, scan: Scan, aligned: AlignmentResult, start: Motion, scale: bool
+) -> tuple[AlignmentResult, list[Finding]]:
+    """Add a verdict and findings, unless the call is ended or there is not enough to judge by."""
+    try:
+        if aligned.valid_views.sum() >= _ENOUGH_TO_JUDGE:
+            aligned = assess(stream, scan, aligned, start, scale=scale)
+        return evidence(stream, scan, aligned)
+    except (Cancelled, DeviceMemoryError):
+        return aligned, []  # which is finished
+    except KeyboardInterrupt:
+        raise AlignmentInterrupted(aligned) from None
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:
