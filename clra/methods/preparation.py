@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.errors import InputError
 from clra.findings import Finding
 from clra.model.bad_pixels import Patches
 from clra.model.corrections.air_region import AirRegion, AirStatistics
@@ -16,7 +15,7 @@ from clra.model.corrections.corrections import Corrections
 from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
 from clra.model.corrections.rings import ring_errors
 from clra.model.scan import Scan
-from clra.model.validation import checked_valid_views
+from clra.model.validation import all_but, checked_valid_views
 from clra.progress import ProgressCallback, tell
 
 # Views that the detector's pixels are judged by: 60 tell a hot pixel from photon noise, and of
@@ -56,12 +55,7 @@ def prepared(
         for finding in scan.corrections.findings:
             finding.warn()
         return scan
-    outside = [view for view in options.exclude if not 0 <= view < scan.views]
-    if outside or len(set(options.exclude)) >= scan.views:
-        found = f"view {outside[0]}" if outside else "all views"
-        raise InputError(
-            f"{scan.name}: exclude: found {found}, expected some of {scan.views} views"
-        )
+    all_but(options.exclude, scan.views)  # refuses what is wrong
     findings: list[Finding] = []
     bad = air = rings = None
     wanted = options.bad_pixels or options.intensity or options.rings
@@ -109,11 +103,10 @@ def with_detector_of(scan: Scan, other: Scan) -> Scan:
 def used_views(scan: Scan, valid: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     """Return which views to use, (views,): those that are valid and not excluded; None for all."""
     excluded = () if scan.corrections is None else scan.corrections.excluded
-    if not excluded:
-        return valid
-    used = np.ones(scan.views, np.bool_) if valid is None else valid.copy()
-    used[list(excluded)] = False
-    return checked_valid_views(used, scan.views)
+    left = all_but(excluded, scan.views)
+    if left is None or valid is None:
+        return valid if left is None else left
+    return checked_valid_views(valid & left, scan.views)
 
 
 def sample_of_views(scan: Scan) -> NDArray[np.intp]:

@@ -30,7 +30,7 @@ class CountedRadiographs:
 
     ``(counts - dark) / (flat - dark)``, with the mean of the dark frames and a flat that runs
     linearly from one group of consecutive flat frames to the next by the number of the frame. Where
-    a flat is saturated, or not above the dark, the pixel is bad: it gets the median of its good
+    a flat is saturated, or not above the dark, the pixel is bad: it is interpolated from its good
     neighbours.
 
     Parameters

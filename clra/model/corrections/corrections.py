@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 class Corrections:
     """Corrections of line integrals p of a scan, in the order in which they are made.
 
-    Bad pixels are interpolated, zingers replaced, the line integral of the air in the view and the
+    Zingers are replaced, bad pixels interpolated, the line integral of the air in the view and the
     error of the pixel subtracted, and beam hardening undone by ``p + c1 p^2 + c2 p^3 + ...``.
 
     Parameters
@@ -83,10 +83,11 @@ class Corrections:
         pixels = pixels.copy()
         patches = self._patches
         for image in pixels:
-            if patches is not None:
-                patches.fill(image)
+            # Before a bad pixel gets a part of one.
             if self.zingers:
                 replace_zingers(image)
+            if patches is not None:
+                patches.fill(image)
             if self.air is not None:
                 image -= np.float32(self.air.level(image))
             if self.rings is not None:

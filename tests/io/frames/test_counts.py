@@ -43,7 +43,7 @@ def test_outside_the_groups_the_nearest_flat_holds() -> None:
     np.testing.assert_allclose(found[:][:, 0, 0], [0.1, 0.05], rtol=1e-6)
 
 
-def test_dead_pixels_get_the_median_beside_them() -> None:
+def test_dead_pixels_are_interpolated() -> None:
     counts = frames()
     ramp = np.arange(13.0)
     counts[2:] = 600 + 10 * ramp
