@@ -66,7 +66,7 @@ def prepared(
         views = np.setdiff1d(views, options.exclude)
         for done, view in enumerate(views):
             tell(progress, "looking for defects", done, len(views))
-            image = scan.read(int(view), int(view) + 1)[0]
+            image = scan.read(int(view), int(view) + 1, check=False)[0]
             statistics.add(image)
             sides.add(image)
         tell(progress, "looking for defects", len(views), len(views))
