@@ -159,7 +159,10 @@ def align(
             versions=versions(stream.device),
             scan=scan.name,
             checksum=scan.checksum(),
-            about={"unobservable": "taken out" if anchor else "left in"},
+            about={
+                "unobservable": "taken out" if anchor else "left in",
+                "corrections": "" if scan.corrections is None else str(scan.corrections),
+            },
         )
 
     scale = estimate != "shift"

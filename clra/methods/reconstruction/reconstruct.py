@@ -14,7 +14,7 @@ from clra.methods.alignment.result import AlignmentResult
 from clra.methods.correction import corrected
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of
 from clra.methods.execution.several_devices import Work, on_devices
-from clra.methods.preparation import prepared
+from clra.methods.preparation import prepared, used_views
 from clra.methods.reconstruction import iterative
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.imgr_state import ImgrStep
@@ -235,6 +235,7 @@ def reconstruct_into(
     with collected() as findings:
         devices = usable_devices(device, progress)
         scan = prepared(scan, corrections, progress=progress)
+        valid_views = used_views(scan, valid_views)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
         small = binned_scan(scan, binning)
