@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from clra.app.plausible import doubt_of_shifts
 from clra.app.progress_bar import duration
 from clra.app.scan_description import Facts, table, views_flagged
+from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
@@ -93,6 +94,8 @@ class Findings:
         Of the scan, for reading.
     quality : Agreement, optional
         What the radiographs alone tell, where the scan was at hand.
+    angles : ndarray, (views,), optional
+        Of the views, not folded into one turn [degree].
     """
 
     result: AlignmentResult
@@ -100,13 +103,14 @@ class Findings:
     comparison: "Comparison | None" = None
     facts: Mapping[str, str] = field(default_factory=dict)
     quality: "Agreement | None" = None
+    angles: Floats | None = None
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Finding, ...]:
         """What the run warned of, and what the scan itself tells against its result."""
         doubt = "" if self.quality is None else doubt_of_shifts(self.quality, self.result.motion)
-        told = (*map(str, self.result.warnings), doubt)
-        return tuple(dict.fromkeys(filter(None, told)))
+        told = [*self.result.warnings, *([Finding("disagreement", doubt)] if doubt else [])]
+        return tuple({str(finding): finding for finding in told}.values())
 
 
 def findings_of(
@@ -158,7 +162,20 @@ def findings_of(
         if _in_both_halves(result.valid_views)
         else None,
         facts=Facts.of(scan).lines(),
+        angles=angles_of(part),
     )
+
+
+def angles_of(scan: Scan) -> Floats:
+    """Return the angle of each view about the axis, not folded into one turn [degree].
+
+    Parameters
+    ----------
+    scan : Scan
+        With its geometry.
+    """
+    x, y = scan.geometry.source[:, 0], scan.geometry.source[:, 1]
+    return np.asarray(np.rad2deg(np.unwrap(np.arctan2(x, -y))))
 
 
 def _in_both_halves(valid_views: NDArray[np.bool_]) -> bool:
