@@ -27,9 +27,8 @@ from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 
-# Updates of the volume, all subsets of all passes. At half of it the residual of a perfect motion
-# is a fifth larger, at twice a tenth smaller.
-_UPDATES = 12
+# Updates of the volume, all subsets of all passes.
+_UPDATES = 9
 # Parts of the views, each predicted from the others: of few views a half is too few to go by.
 _FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
 # Photons that weigh the rays against each other: nearly alike.

@@ -35,6 +35,8 @@ _DOUBTFUL, _FAILED = 0.3, 2.0
 _UNEXPLAINED, _HOPELESS = 0.16, 0.5
 # Views below which many of them are not predicted for lack of others.
 _FEW = 40
+# Points of the sample by which the gauge is known.
+_POINTS = 300
 # Views at each side over which squares of what is found left are averaged.
 _AROUND = 4
 
@@ -220,7 +222,7 @@ class _Left:
 
     def __init__(self, scan: Scan, scale: bool) -> None:
         self._geometry, self._scale = scan.geometry, scale
-        self._points = sample_points(default_grid(scan.geometry))
+        self._points = sample_points(default_grid(scan.geometry), _POINTS)
 
     def of(self, predicted: Predicted) -> Floats:
         """Shifts and magnification, (views, 3); NaN for views that were not held out."""
