@@ -66,6 +66,54 @@ def atomic_path(path: str | os.PathLike[str], size: int = 0) -> Iterator[Path]:
         raise _explained(path, error) from error
 
 
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str], size: int = 0) -> Iterator[Path]:
+    """Yield a temporary folder beside `path` that takes its place once all went well.
+
+    Parameters
+    ----------
+    path : path-like
+        Where the folder is to appear. A folder that is there is replaced only if it is a Zarr.
+    size : int
+        Bytes that will be written: refused at once where the disk lacks them.
+
+    Yields
+    ------
+    Path
+        An empty folder.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be made, written or renamed.
+    """
+    target = _target(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    former = target.with_name(f".{target.name}.{os.getpid()}.former")
+    outputs().check(target)
+    try:
+        with held(target):
+            try:
+                temporary.mkdir()
+                probe = temporary / ".room"
+                _check_room(probe, size)
+                probe.unlink()
+                yield temporary
+                outputs().check(target)
+                if target.exists():
+                    os.replace(target, former)
+                os.replace(temporary, target)
+                outputs().written.add(target)
+                _flush(target.parent)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+                if former.exists() and not target.exists():
+                    os.replace(former, target)
+                shutil.rmtree(former, ignore_errors=True)
+    except (OSError, RuntimeError) as error:
+        raise _explained(path, error) from error
+
+
 def ensure_writable(
     path: str | os.PathLike[str],
     keep: Iterable[str | os.PathLike[str] | None] = (),
@@ -115,6 +163,8 @@ def ensure_writable(
 def _target(path: str | os.PathLike[str]) -> Path:
     """Follow `path` to its file; refuse what a rename must not replace: folders, devices, pipes."""
     target = Path(os.path.realpath(path))
+    if target.suffix.lower() == ".zarr" and (target / "zarr.json").is_file():
+        return target  # a volume that was written before
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "no regular file"
         raise OutputError(f"cannot write {os.fspath(path)}: it is {kind}; give a file's name")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -116,7 +117,7 @@ def _acquire(target: Path) -> int:
     if locked:
         for part in target.parent.glob(f".{escape(target.name)}.*.part"):
             with suppress(OSError):
-                part.unlink()
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
     return descriptor
 
 

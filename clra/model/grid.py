@@ -180,6 +180,58 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     return VolumeGrid(shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, z))
 
 
+Interval = tuple[float | None, float | None]
+Region = tuple[Interval, Interval, Interval]
+
+
+def volume_grid(
+    geometry: ConeBeamGeometry,
+    *,
+    roi: Region | None = None,
+    voxel_size: float | None = None,
+) -> VolumeGrid:
+    """Return the grid of the field of view with another voxel, or a part of it.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the scan, at the resolution wanted.
+    roi : ((x0, x1), (y0, y1), (z0, z1)), optional
+        Region to cover [mm]; None for an end where :func:`default_grid` ends. Voxels are those of
+        the whole grid.
+    voxel_size : float, optional
+        In mm; by default that of :func:`default_grid`.
+
+    Returns
+    -------
+    VolumeGrid
+
+    Raises
+    ------
+    InputError
+        If the region is empty.
+    """
+    whole = default_grid(geometry)
+    if voxel_size is not None:
+        size = positive("voxel_size", voxel_size)
+        nz, ny, nx = (max(1, math.ceil(n * whole.voxel_size / size - _SLACK)) for n in whole.shape)
+        whole = VolumeGrid(shape=(nz, ny, nx), voxel_size=size, centre=whole.centre)
+    if roi is None:
+        return whole
+    starts, counts = [], []
+    for name, (low, high), axis in zip("xyz", roi, whole.coordinates(), strict=True):
+        size, edge = whole.voxel_size, axis[0] - 0.5 * whole.voxel_size
+        start = 0 if low is None else math.floor((low - edge) / size + _SLACK)
+        stop = len(axis) if high is None else math.ceil((high - edge) / size - _SLACK)
+        if stop <= start or (low is not None and high is not None and high <= low):
+            found = f"{low} to {high} mm of {edge:.4g} to {edge + len(axis) * size:.4g} mm"
+            raise InputError(f"roi: found {name} {found}, expected two places in order")
+        starts.append(start)
+        counts.append(stop - start)
+    shape = (counts[2], counts[1], counts[0])
+    return whole._moved(shape, whole.voxel_size, (starts[0], starts[1], starts[2]))
+
+
 def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:
     """Lowest and highest point of the axis that enough views see [mm]."""
     matrices = geometry.projection_matrices()

@@ -10,6 +10,7 @@ from clra.app.console import Console, Memory, Reading
 from clra.errors import InputError
 
 if TYPE_CHECKING:
+    from clra.model.geometry import ConeBeamGeometry
     from clra.model.grid import VolumeGrid
 
 
@@ -55,15 +56,102 @@ class Iterating:
         return {name: value for name, value in given.items() if value is not None}
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """Which voxels, of which pixels."""
+
+    roi: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0:X1,Y0:Y1,Z0:Z1",
+            help="Region to reconstruct, in mm from the axis and the scan's middle height; an end "
+            "that is left out is that of the field of view.",
+        ),
+    ] = None
+    voxel_size: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="Edge of a voxel; by default a pixel seen at the axis."),
+    ] = None
+    bin: Annotated[
+        int, typer.Option(metavar="N", help="Average N x N pixels (and so voxels) first.")
+    ] = 1
+    window: Annotated[
+        str,
+        typer.Option(
+            metavar="ram-lak|shepp-logan|hann",
+            help="fbp: window of the ramp filter, against noise.",
+        ),
+    ] = "ram-lak"
+
+    def options(self) -> dict[str, Any]:
+        """Return what `reconstruct` takes, but for the grid."""
+        from clra.ops.filtering.ramp import WINDOWS
+
+        if self.bin < 1:
+            raise InputError(f"--bin: found {self.bin}, expected 1 or more")
+        if self.window not in WINDOWS:
+            raise InputError(f"--window: found {self.window!r}, expected {', '.join(WINDOWS)}")
+        return {"binning": self.bin, "window": self.window}
+
+    def grid(self, geometry: "ConeBeamGeometry") -> "VolumeGrid":
+        """Return the grid that is asked for."""
+        from clra.app.arguments import region
+        from clra.model.grid import volume_grid
+
+        roi = None if self.roi is None else region("--roi", self.roi)
+        return volume_grid(geometry.binned(self.bin), roi=roi, voxel_size=self.voxel_size)
+
+
+@dataclass(frozen=True)
+class Storing:
+    """How voxels are stored."""
+
+    dtype: Annotated[
+        str,
+        typer.Option(
+            metavar="float32|uint16|uint8", help="Of the voxels; integers with their scale."
+        ),
+    ] = "float32"
+    limits: Annotated[
+        str,
+        typer.Option(
+            metavar="LOW,HIGH|LOW%,HIGH%",
+            help="Values in 1/mm, or percentiles of the voxels, that are the least and the "
+            "greatest integer.",
+        ),
+    ] = "0.01%,99.99%"
+    compress: Annotated[
+        bool, typer.Option("--compress", help="Compress a .h5; .zarr is in any case.")
+    ] = False
+
+    def options(self) -> dict[str, Any]:
+        """Return what `open_volume` takes."""
+        from clra.app.arguments import limits_of_integers
+        from clra.io.volumes.volume_description import TYPES
+
+        if self.dtype not in TYPES:
+            raise InputError(f"--dtype: found {self.dtype!r}, expected one of {', '.join(TYPES)}")
+        limits = limits_of_integers("--limits", self.limits)
+        compression = "gzip" if self.compress else None
+        return {"dtype": self.dtype, "limits": limits, "compression": compression}
+
+
 def reconstruct(
     console: Console,
     reading: Reading,
     memory: Memory,
+    sampling: Sampling,
+    storing: Storing,
     iterating: Iterating,
     scan: Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")],
     out: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="VOLUME", help="Volume to write: .h5 or .tif."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="VOLUME",
+            help="Volume to write: .h5, .tif, .zarr, .nrrd or .raw.",
+        ),
     ],
     method: Annotated[
         str,
@@ -92,7 +180,9 @@ def reconstruct(
     Examples
     --------
       clra reconstruct scan.nxs -o volume.h5 --motion motion.h5
-      clra reconstruct scan.nxs -o volume.tif --align
+      clra reconstruct scan.nxs -o volume.tif --align --dtype uint16
+      clra reconstruct scan.nxs -o part.zarr --motion motion.h5 --roi=-1:1,-1:1,0:0.5
+      clra reconstruct scan.nxs -o overview.h5 --bin 4
       clra reconstruct helix.nxs -o volume.h5 --method katsevich --align
       clra reconstruct scan.nxs -o volume.h5 --method imgr --align
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
@@ -103,11 +193,11 @@ def reconstruct(
     from clra.app.scan_description import metric
     from clra.io.atomic import ensure_writable
     from clra.io.provenance import provenance
+    from clra.io.volumes.raw_volume import sidecar
     from clra.io.volumes.volume_files import open_volume
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.methods.reconstruction.iterative import options_for
     from clra.methods.reconstruction.reconstruct import METHODS, reconstruct_into
-    from clra.model.grid import default_grid
 
     volume_file(out)
     limits = memory.limits()
@@ -116,8 +206,9 @@ def reconstruct(
     if method not in METHODS:
         raise InputError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
     given = iterating.options()
+    sampled, stored = sampling.options(), storing.options()
     opened = reading.scan(scan)
-    grid = default_grid(opened.cropped().geometry)
+    grid = sampling.grid(opened.cropped().geometry)
     initial = None
     if given.get("initial") not in (None, "fbp", "uniform"):
         initial = Path(given["initial"])
@@ -131,6 +222,8 @@ def reconstruct(
         opened, alignment = alignment_for(opened, motion, reading.geometry())
     nz, ny, nx = grid.shape
     ensure_writable(out, (scan, motion, initial), 4 * nz * ny * nx)
+    if out.suffix.lower() == ".raw":
+        ensure_writable(sidecar(out), (scan, motion, initial))
     made = provenance(
         command=command_line(),
         scan=opened,
@@ -141,7 +234,7 @@ def reconstruct(
     )
     checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
     with console.progress() as progress, keeping(checkpoint):
-        with open_volume(out, grid, provenance=made) as target:
+        with open_volume(out, grid, provenance=made, **stored) as target:
             done = reconstruct_into(
                 target,
                 opened,
@@ -153,6 +246,7 @@ def reconstruct(
                 options=options,
                 progress=progress,
                 checkpoint=checkpoint,
+                **sampled,
                 **limits,
             )
         checkpoint.clear()

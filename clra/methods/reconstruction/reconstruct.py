@@ -22,14 +22,16 @@ from clra.methods.reconstruction.iterative import Options
 from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevich
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
+from clra.model.binning import binned_motion, binned_scan
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
-from clra.model.grid import VolumeGrid, default_grid
+from clra.model.grid import Region, VolumeGrid, volume_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
 from clra.model.validation import checked_valid_views
+from clra.ops.filtering.ramp import WINDOWS
 from clra.ops.runtime.devices import usable_devices
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -56,6 +58,10 @@ def reconstruct(
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
     corrections: CorrectionOptions | None = None,
+    binning: int = 1,
+    roi: Region | None = None,
+    voxel_size: float | None = None,
+    window: str = "ram-lak",
 ) -> NDArray[np.float32]:
     """Reconstruct a volume.
 
@@ -65,9 +71,8 @@ def reconstruct(
         Radiographs and their geometry.
     method : {"fbp", "katsevich", "osem-tr", "imgr"}
         Ramp-filtered back-projection, for any trajectory; Katsevich's, which is exact, for helices
-        and double helices; ordered subsets for counted photons
-        (`osem_tr`); or the paper's Algorithm 3, which solves the lowest
-        resolution by these and corrects the higher ones once (`imgr`).
+        and double helices; ordered subsets for counted photons (`osem_tr`); or the paper's
+        Algorithm 3, which solves the lowest resolution by these and corrects the higher ones once.
     grid : VolumeGrid, optional
         Where to reconstruct; by default the whole field of view
         (:func:`clra.model.grid.default_grid`).
@@ -78,8 +83,8 @@ def reconstruct(
         Estimate the motion first, with the defaults of :func:`clra.align`; "imgr" does so on the
         way.
     device : str or cl.Device, optional
-        As `choose_device` takes it, or "all" to share the work out to all
-        devices of the best kind; alignment and iterative methods take the first of them.
+        As `choose_device` takes it, or "all" to share the work out to all devices of the best kind;
+        alignment and iterative methods take the first of them.
     alignment : AlignmentResult, optional
         In place of `motion`: views that it rejects are left out.
     valid_views : ndarray of bool, (views,), optional
@@ -98,10 +103,16 @@ def reconstruct(
     resume : bool
         Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional
-        Bytes that may be used, see `Stream`. The volume that is returned
-        comes on top: :func:`reconstruct_into` takes one larger than the memory.
+        Bytes that may be used, see `Stream`. The volume that is returned comes on top:
+        :func:`reconstruct_into` takes one larger than the memory.
     corrections : CorrectionOptions, optional
         Defects of the radiographs to look for and correct first; by default the defaults of these.
+    binning : int
+        Average radiographs over this many rows and columns first, but align the whole ones.
+    roi, voxel_size
+        Of the grid if none is given, see :func:`clra.model.grid.volume_grid`.
+    window : {"ram-lak", "shepp-logan", "hann"}
+        Of the ramp filter of "fbp": the latter two trade resolution for less noise.
 
     Returns
     -------
@@ -117,7 +128,8 @@ def reconstruct(
     Cancelled
         If `progress` raised it before anything was finished.
     """
-    planes = HostPlanes(grid or default_grid(scan.cropped().geometry))
+    seen = scan.cropped().geometry.binned(binning)
+    planes = HostPlanes(grid or volume_grid(seen, roi=roi, voxel_size=voxel_size))
     reconstruct_into(
         planes,
         scan,
@@ -135,6 +147,8 @@ def reconstruct(
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
         corrections=corrections,
+        binning=binning,
+        window=window,
     )
     return planes.volume
 
@@ -176,16 +190,20 @@ def reconstruct_into(
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
     corrections: CorrectionOptions | None = None,
+    binning: int = 1,
+    roi: Region | None = None,
+    voxel_size: float | None = None,
+    window: str = "ram-lak",
 ) -> Reconstruction:
     """Reconstruct a volume, and hand it on some planes at a time.
 
     Parameters
     ----------
     target : PlaneWriter
-        Takes the planes, each once; `open_volume` gives one that writes a
-        file.
+        Takes the planes, each once; `open_volume` gives one that writes a file.
     scan, method, grid, motion, align, device, alignment, valid_views, options, progress, \
-    checkpoint, resume, max_device_memory, max_host_memory, corrections
+    checkpoint, resume, max_device_memory, max_host_memory, corrections, binning, roi, voxel_size, \
+    window
         As :func:`reconstruct` takes them.
 
     Returns
@@ -199,6 +217,10 @@ def reconstruct_into(
     """
     if method not in METHODS:
         raise InputError(f"method: found {method!r}, expected one of {METHODS}")
+    if window not in WINDOWS or (window != "ram-lak" and method != "fbp"):
+        raise InputError(f"window: found {window!r}, expected one of {WINDOWS} with method 'fbp'")
+    if binning > 1 and align and method == "imgr":
+        raise InputError(f"binning: found {binning} where imgr aligns, expected 1; align before")
     if align + (motion is not None) + (alignment is not None) > 1:
         raise InputError("motion, alignment and align: found more than one, expected one of them")
     if alignment is not None:
@@ -215,7 +237,8 @@ def reconstruct_into(
         scan = prepared(scan, corrections, progress=progress)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
-        grid = grid or default_grid(scan.geometry)
+        small = binned_scan(scan, binning)
+        grid = grid or volume_grid(small.geometry, roi=roi, voxel_size=voxel_size)
         limits: dict[str, Any] = {
             "max_device_memory": max_device_memory,
             "max_host_memory": max_host_memory,
@@ -224,7 +247,7 @@ def reconstruct_into(
         fitted: Exact | None = None
         if method == "katsevich":
             # What it cannot treat it refuses before the long work.
-            whole = without_gaps(scan, valid_views)
+            whole = without_gaps(small, valid_views)
             fitted = exact_helices(Radiographs(stream, whole, 1), whole.geometry, grid)
         if align and method != "imgr":
             begun = None if keeping is None else keeping.part("alignment")
@@ -236,6 +259,9 @@ def reconstruct_into(
                 scan, device=devices[0], progress=progress, checkpoint=begun, **limits
             )
             motion, valid_views = alignment.motion, alignment.valid_views
+        if motion is not None:
+            motion = binned_motion(motion, binning, scan.geometry.shape)
+        scan = small
         _warn_of_scan(stream, scan, method)
         if fitted is not None:
             there = scan.views if valid_views is None else int(valid_views.sum())
@@ -246,7 +272,7 @@ def reconstruct_into(
             steps, found = iterative.iterate(stream, target, request, keeping)
             alignment = found or alignment
         else:
-            work = _work(scan, grid, motion, valid_views, fitted)
+            work = _work(scan, grid, motion, valid_views, fitted, window)
             if len(devices) == 1:
                 work(stream, slice(0, grid.shape[0]), target)
             else:
@@ -262,6 +288,7 @@ def _work(
     motion: Motion | None,
     valid_views: NDArray[np.bool_] | None,
     fitted: Exact | None,
+    window: str,
 ) -> Work:
     """Return what reconstructs some planes: by Katsevich's method if helices are given."""
 
@@ -281,6 +308,7 @@ def _work(
                 geometry,
                 grid,
                 valid_views=valid_views,
+                window=window,
                 planes=planes,
                 target=target,
             )

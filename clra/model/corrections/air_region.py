@@ -21,9 +21,9 @@ Tile = tuple[int, int, int, int]
 _STRIP, _LEAST_COLUMNS, _ALONG = 0.05, 4, 8
 # Tiles of air agree from view to view within this line integral, or this part of the contrast of
 # the radiographs, whichever is more, on top of the noise: a sample that reaches in shows more.
-_AGREEMENT, _OF_CONTRAST = 0.004, 0.01
+_AGREEMENT, _OF_CONTRAST = 0.004, 0.03
 # Part of the tiles of a side that has to be air, and of the views in which a tile has to be.
-_TILES, _VIEWS = 0.25, 0.97
+_TILES, _VIEWS = 0.25, 0.9
 # Beams that are steadier than this line integral are left as they are.
 _STEADY = 0.003
 # Part of the views that this is judged by, without the farthest off.

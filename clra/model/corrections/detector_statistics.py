@@ -50,6 +50,8 @@ _FLOOR, _CONSTANT = 0.04, 1e-3
 _LINE = 0.6
 # Few views, in which no neighbour may vary as little as a pixel that is insensitive.
 _FEW = 15
+# Standard deviation, for that of the mean image, below which a pixel counts as constant.
+_ROUNDING = 1e-4
 # Fewest views that tell anything.
 FEWEST = 5
 
@@ -133,8 +135,9 @@ class DetectorStatistics:
         count = self.views - 2
         mean = (self._sum - low - high) / count
         square = (self._squares - low**2 - high**2) / count - mean**2
-        # What rounding leaves of a constant is not a variance.
-        rounding = 1e-12 * (self._squares / self.views)
+        # What rounding leaves of a constant is not a variance, nor is anything so far below what
+        # the image itself spans: a simulation of a round sample that stands still.
+        rounding = np.maximum(1e-12 * (self._squares / self.views), _ROUNDING**2 * mean.var())
         variance = np.where(square > rounding, square, 0) * count / (count - 1)
         return mean.astype(np.float32), variance.astype(np.float32)
 
