@@ -16,6 +16,7 @@ import numpy as np
 import typer
 
 from clra.app import progress_bar
+from clra.errors import InputError
 from clra.findings import collected, collected_so_far
 
 if TYPE_CHECKING:
@@ -167,9 +168,15 @@ class Reading:
         return None if recognise(path) is None else read_scanner(path, self._options())
 
     def start_motion(self, path: Path, views: int) -> "Motion | None":
-        """Read the motion that a scanner's software measured; None of other files."""
+        """Read a motion of a table, or that a scanner's software measured; None of other files."""
+        from clra.io.motion_formats.motion_csv import is_motion_csv, read_motion_csv
         from clra.io.scanners.recognise import holds_start_motion, read_start_motion
 
+        if is_motion_csv(path):
+            motion = read_motion_csv(path)[0]
+            if motion.views != views:
+                raise InputError.at(path, "view", f"{motion.views} views", f"{views} of the scan")
+            return motion
         if not holds_start_motion(path):
             return None
         return read_start_motion(path, views, self._options())

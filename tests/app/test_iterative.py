@@ -161,7 +161,7 @@ def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("default")
 def test_imgr_crops_masked_detectors_and_tells_of_truncation(clra, tmp_path):
     geometry = paper_like("circular", 24, (24, 33))
-    wide = Ellipsoids([[0, 0, 0]], [[3.0, 3.0, 3.0]], [0.1]).line_integrals(geometry)
+    wide = Ellipsoids([[0.4, 0.2, 0]], [[1.5, 1.5, 1.5]], [0.5]).line_integrals(geometry)
     mask = np.ones(geometry.shape, np.bool_)
     mask[:, :4] = False
     path, out = tmp_path / "masked.nxs", tmp_path / "v.h5"

@@ -38,7 +38,8 @@ def align(
         typer.Option(
             metavar="MOTION",
             help="Motion to start from: MOTION.h5 of a run that was interrupted or shall be "
-            "refined, or what a scanner's software measured (.txrm, .pcr, _TS.csv, CTSimU .json).",
+            "refined, a table as clra export-motion writes it, or what a scanner's software "
+            "measured (.txrm, .pcr, _TS.csv, CTSimU .json).",
         ),
     ] = None,
     autofocus: Annotated[

@@ -270,7 +270,8 @@ def _excess(mean: Floats, step: tuple[int, int], distance: int) -> tuple[Floats,
     above, below = mean - near[2], near[1] - mean
     return (
         np.maximum(above, below),
-        near[2] - near[1],
+        # Of three of them: two may be alike by chance, such as on either side of a round sample.
+        np.minimum(near[3] - near[1], near[2] - near[0]),
         np.where(above > below, np.float32(1), np.float32(-1)),
     )
 
