@@ -92,7 +92,8 @@ def contradicted_geometry(stream: Stream, scan: Scan) -> Finding | None:
             found = _unexplained(stream, pixels, hypothesis.geometry, level)
         except InputError:
             continue  # no detector sees the axis so, or the grid reaches behind the source
-        if found < best:
+        # Mirrored scans fit alike: the simpler explanation comes first.
+        if found < (own if chosen is None else 0.95 * best):
             best, chosen = found, hypothesis
     limit = _BETTER_AXIS if chosen is not None and chosen.code == "axis-offset" else _BETTER
     if chosen is None or best > limit * own:
