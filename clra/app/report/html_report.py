@@ -14,8 +14,9 @@ from clra.app.report.before_after import before_and_after
 from clra.app.report.summary import Errors, Findings
 from clra.app.scan_description import listed
 from clra.io.atomic import atomic_path
-from clra.methods.alignment.agreement import Agreement
+from clra.methods.alignment.quality import Quality
 from clra.methods.alignment.result import AlignmentResult, Iteration
+from clra.methods.assessment.agreement import Agreement
 
 _COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
 _UNOBSERVABLE = {
@@ -55,12 +56,8 @@ def render(findings: Findings) -> str:
     """
     result = findings.result
     body = [
+        *_verdict(findings),
         page.cards(_cards(findings)),
-        *(
-            [page.section("Warnings", *map(page.paragraph, findings.notes))]
-            if findings.notes
-            else []
-        ),
         _corrections(result),
         *([_history(result.history)] if result.history else []),
         *([_errors(findings.errors)] if findings.errors else []),
@@ -77,6 +74,20 @@ def render(findings: Findings) -> str:
     name = result.scan or "a scan"
     versions = ", ".join(f"{name} {version}" for name, version in _versions().items())
     return page.page(f"Alignment of {name}", " ".join(subtitle), body, f"Made by {versions}.")
+
+
+def _verdict(findings: Findings) -> list[str]:
+    """Tell what to think of the result before the numbers, in colour, and all warnings."""
+    quality = findings.result.quality
+    if isinstance(quality, Quality):
+        told = (
+            f"Expected error {quality.error:.2f} pixel. {100 * quality.residual_after:.1f} % of a "
+            "held-out radiograph is not predicted by a volume from the others, "
+            f"{100 * quality.residual_before:.1f} % at the start."
+        )
+        word = f"Verdict: {quality.verdict}"
+        return [page.banner(word, quality.verdict, [told, *findings.notes])]
+    return [page.banner("Warnings", "doubtful", findings.notes)] if findings.notes else []
 
 
 def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:

@@ -42,6 +42,9 @@ pre { background: #f3f5f7; border-radius: 6px; padding: .7rem .9rem; margin: 0; 
   font: .88rem/1.5 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
 .columns { display: grid; grid-template-columns: repeat(auto-fit, minmax(330px, 1fr));
   gap: 0 2.4rem; margin-bottom: 1rem; }
+.good { border-left: 8px solid #009e73; }
+.doubtful { border-left: 8px solid #e69f00; background: #fff8e8; }
+.failed { border-left: 8px solid #d55e00; background: #fdeee6; }
 footer { color: var(--soft); font-size: .85rem; }
 @media print { body { background: #fff; } section, .card { break-inside: avoid; } }
 """
@@ -86,6 +89,12 @@ def cards(values: Iterable[tuple[str, str, str, str]]) -> str:
         for name, value, unit, note in values
     )
     return '<div class="cards">' + "".join(boxes) + "</div>"
+
+
+def banner(word: str, tone: str, lines: Iterable[str]) -> str:
+    """Box in the colour of a verdict ("good", "doubtful", "failed") with lines of text."""
+    told = "\n".join(paragraph(line) for line in lines)
+    return f'<section class="{escape(tone)}"><h2>{escape(word)}</h2>\n{told}</section>'
 
 
 def facts(values: Mapping[str, str]) -> str:

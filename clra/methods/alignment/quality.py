@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from clra.findings import Finding
-from clra.methods.alignment.held_out import HeldOut, Predicted, is_cut_off
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.held_out import HeldOut, Predicted, is_cut_off
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion

@@ -9,8 +9,8 @@ from clra.app.report.comparison import Comparison, MatchedView, Pair
 from clra.app.report.html_report import render, write_report
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
-from clra.methods.alignment.agreement import Agreement
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.agreement import Agreement
 from clra.model.motion import Motion
 
 
