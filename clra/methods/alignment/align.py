@@ -12,10 +12,10 @@ from clra.methods.alignment.quality import assess
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
 from clra.methods.preparation import prepared, with_detector_of
-from clra.methods.radiograph_checks import refuse_counts
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.model.corrections.correction_options import CorrectionOptions
@@ -226,7 +226,8 @@ def align(
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
             aligned, told_of = _judged(stream, part, aligned, start, scale)
-            findings += told_of
+            for finding in told_of:
+                finding.record()
         result = told(aligned)
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.alignment.align import align
-from clra.methods.alignment.slice_sharpness import VIEWS, Slices
+from clra.methods.assessment.slice_sharpness import VIEWS, Slices
 from clra.model.detector_pose import with_detector
 from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from clra.errors import InputError
 from clra.findings import Finding
@@ -79,7 +80,8 @@ def radiograph_findings(scan: Scan) -> list[Finding]:
     views = views[~odd]
     if not images:
         return []
-    bright = np.array([np.quantile(image, 0.02) for image in images])
+    # Means over some pixels: the brightest single ones are noise.
+    bright = np.array([np.quantile(uniform_filter(image, 9), 0.05) for image in images])
     most = max(float(np.quantile(image, 0.999)) for image in images)
     found = [_fading(bright, views), *_clipped(images[:: max(1, len(images) // _CLOSELY)])]
     columns = np.array([_border(image[:, [0, -1]]) for image in images]) - bright[:, None]
