@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
+from clra.model.rigid_motion import RigidMotion, absorb
 from clra.model.validation import detector_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ class ConeBeamGeometry:
         """(column, row) of the detector's centre."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
-    def with_motion(self, motion: Motion) -> ConeBeamGeometry:
+    def with_motion(self, motion: Motion | RigidMotion) -> ConeBeamGeometry:
         """Absorb the motion of each view, so that no radiograph is resampled.
 
         A point that this geometry puts at pixel q, the returned one puts at
@@ -161,20 +162,22 @@ class ConeBeamGeometry:
 
         Parameters
         ----------
-        motion : Motion
+        motion : Motion or RigidMotion
             Shifts in pixels of this geometry's detector: absorb first, bin after.
 
         Returns
         -------
         ConeBeamGeometry
             With u / m, v / m and detector - (shift_u u + shift_v v) / m; for a motion of the source
-            with the source moved by `source_displacement`.
+            moved by `source_displacement`; for a rigid one with all four vectors moved back.
 
         Raises
         ------
         InputError
             If the motion is of another number of views.
         """
+        if isinstance(motion, RigidMotion):
+            return ConeBeamGeometry(**absorb(self, motion), shape=self.shape)
         if motion.views != self.views:
             raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
