@@ -43,7 +43,11 @@ kernel void forward_rays(
         from_plane,
         to_plane};
     const int axis = main_axis(s.view, c, r, 0);
-    const float integral = voxel_size * stretch(s, c, r, axis) * trace(s, c, r, axis);
+    const sums integral = voxel_size * stretch(s, c, r, axis) * trace(s, c, r, axis);
     global float *target = projections + ((size_t)view * (columns + 1) + c) * pitch + r;
-    *target = from_plane > 0 ? *target + integral : integral;
+    *target = from_plane > 0 ? *target + INTEGRAL(integral) : INTEGRAL(integral);
+#ifdef MOMENT
+    target += (size_t)count * (columns + 1) * pitch;
+    *target = from_plane > 0 ? *target + integral.s1 : integral.s1;
+#endif
 }

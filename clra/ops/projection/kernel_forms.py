@@ -30,7 +30,7 @@ class Blocks:
     most : int
         Elements of a block on a CPU.
     defines : mapping, optional
-        Further preprocessor definitions of a CPU's kernels.
+        Further preprocessor definitions.
     """
 
     def __init__(
@@ -51,7 +51,9 @@ class Blocks:
         block = _ROUND * -(-length // (blocks * _ROUND))
         self._blocks = -(-length // block)
         lanes = {"LANES": layout.lanes}
-        self._defines = [lanes] + 2 * [{**lanes, "BLOCK": block, **(defines or {})}]
+        self._defines = [{**lanes, **(defines or {})}] + 2 * [
+            {**lanes, "BLOCK": block, **(defines or {})}
+        ]
         self._steps: dict[int, Step] = {}
         self._step(self._form)
 

@@ -80,13 +80,17 @@ class ForwardProjector:
         scratch_limit: int | None = None,
         _lanes: int | None = None,
         _tilted: bool = False,
+        _moment: bool = False,
     ) -> None:
         self._layout = Layout(
             context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
         )
         self.scratch_bytes = self._layout.scratch_bytes
         kernels = ("forward_rays", "forward_columns", "forward_tilted")
-        self._project = Blocks(self._layout, "forwardproject", kernels, geometry.rows, _LINE)
+        moment = {"MOMENT": 1} if _moment else None
+        self._project = Blocks(
+            self._layout, "forwardproject", kernels, geometry.rows, _LINE, moment
+        )
         nz, ny, nx = grid.shape
         planes = max(nz, ny, nx)
         thick = planes
@@ -140,13 +144,25 @@ class ForwardProjector:
         TypeError, InputError
             If an argument is none of the above.
         """
+        return self._run(queue, (projections_out,), volume, views, accumulate, wait_for)
+
+    def _run(
+        self,
+        queue: cl.CommandQueue,
+        outputs: tuple[Array, ...],
+        volume: Array,
+        views: slice | None,
+        accumulate: bool,
+        wait_for: Sequence[cl.Event] | None,
+    ) -> cl.Event:
+        """Fill one or two integrals of each ray; of two, those of a batch follow each other."""
         layout = self._layout
         names = ("volume", "projections_out")
-        start, stop = layout.check(queue, names, volume, projections_out, views)
+        start, stop = layout.check(queue, names, volume, outputs[0], views)
         events: Sequence[cl.Event] = [*(wait_for or ()), *layout.last]
         columns, events = layout.gather_volume(queue, volume, events)
-        for first, last in layout.batches(stop - start):
-            lines = layout.scratch_projections(last - first)
+        for first, last in layout.batches(stop - start, len(outputs)):
+            lines = layout.scratch_projections(len(outputs) * (last - first))
             for planes in self._parts:
                 event = self._project(
                     queue,
@@ -159,11 +175,14 @@ class ForwardProjector:
                     wait_for=events,
                 )
                 events = [event]
-            event = layout.scatter_projections(
-                queue, projections_out[first:last], accumulate, events
-            )
-            layout.last = events = [event]
-        return event
+            layout.last = [
+                layout.scatter_projections(
+                    queue, out[first:last], accumulate, events, k * (last - first)
+                )
+                for k, out in enumerate(outputs)
+            ]
+            events = layout.last
+        return events[0] if len(events) == 1 else cl.enqueue_marker(queue, wait_for=events)
 
 
 class BackProjector:

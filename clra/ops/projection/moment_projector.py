@@ -1,0 +1,84 @@
+"""Line integrals of a volume and of the volume over its depth, in one pass."""
+
+from collections.abc import Sequence
+
+import pyopencl as cl
+from pyopencl.array import Array
+
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.ops.projection.projector import ForwardProjector
+from clra.ops.runtime.buffers import Allocator
+
+
+class MomentProjector(ForwardProjector):
+    r"""Integrals :math:`\int f\,dl` and :math:`\int f / g\,dl` along each ray, by Joseph's method.
+
+    g is the depth of a point as a fraction of the detector's, 0 at the source. From the image
+    gradients of the two follows what any small rigid motion of the sample does to a radiograph, see
+    :class:`clra.ops.registration.rigid.RigidRegistration`. The first integral is that of
+    :class:`ForwardProjector` to the last bit.
+
+    Parameters
+    ----------
+    context, geometry, grid, volume_order, allocator, scratch_limit
+        As for :class:`ForwardProjector`.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        *,
+        volume_order: str = "zyx",
+        allocator: Allocator | None = None,
+        scratch_limit: int | None = None,
+    ) -> None:
+        super().__init__(
+            context,
+            geometry,
+            grid,
+            volume_order=volume_order,
+            allocator=allocator,
+            scratch_limit=scratch_limit,
+            _moment=True,
+        )
+
+    def moments(
+        self,
+        queue: cl.CommandQueue,
+        projections_out: Array,
+        over_depth_out: Array,
+        volume: Array,
+        *,
+        views: slice | None = None,
+        accumulate: bool = False,
+        wait_for: Sequence[cl.Event] | None = None,
+    ) -> cl.Event:
+        """Project.
+
+        Parameters
+        ----------
+        queue : cl.CommandQueue
+            In order or out of order.
+        projections_out, over_depth_out : cl.array.Array
+            float32 (n, rows, columns), overwritten: integrals of the volume, and of the volume over
+            the depth; the volume's unit times mm.
+        volume, views, accumulate, wait_for
+            As for :class:`ForwardProjector`.
+
+        Returns
+        -------
+        cl.Event
+
+        Raises
+        ------
+        TypeError, InputError
+            If an argument is none of the above.
+        """
+        names = ("volume", "over_depth_out")
+        self._layout.check(queue, names, volume, over_depth_out, views)
+        return self._run(
+            queue, (projections_out, over_depth_out), volume, views, accumulate, wait_for
+        )
