@@ -9,7 +9,10 @@
 // CPUs run adjoint_columns.cl or adjoint_tilted.cl instead, and leave it the rays sampled across z.
 // Every voxel, and the one beyond, has to be in front of every source.
 
-#include "geometry.clh"
+#ifndef LANES
+#define LANES 1 // 1, 8 or 16
+#endif
+
 #include "pieces.clh"
 
 // Rounding must not leave out a ray that shares in a voxel; one ray too many has no weight.

@@ -10,9 +10,9 @@
 // Steps: block_means, wide_rows, wide_columns, expand_columns, narrow_rows, bandpass_columns. A
 // work-item makes LANES columns of one row, in block_means one pixel. Global sizes are (columns or
 // blocks of LANES columns, rows, views), rounded up at will. All images but the input are lined
-// (see lanes.clh). Taps are symmetric and reach `radius` <= MARGIN both ways.
+// (see vectors.clh). Taps are symmetric and reach `radius` <= MARGIN both ways.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 #define RIM 2 // blocks before the first; behind the last there are one more
 
@@ -78,14 +78,14 @@ kernel void wide_rows(
     if (i >= columns || j >= rows || view >= views)
         return;
     const ulong at = ((ulong)view * rows + j) * stride + MARGIN + i;
-    floatn sum = 0.0f, moment = 0.0f;
+    real sum = 0.0f, moment = 0.0f;
     for (int k = -min(radius, j); k <= min(radius, rows - 1 - j); ++k) {
-        const floatn value = taps[k + radius] * load_unaligned(means + at + (long)k * stride);
+        const real value = taps[k + radius] * load_global(means + at + (long)k * stride);
         sum += value;
         moment += k * value;
     }
-    store_unaligned(sum, zeroth + at);
-    store_unaligned(moment, first + at);
+    store_global(sum, zeroth + at);
+    store_global(moment, first + at);
 }
 
 // The fitted plane's value: a combination, known in advance, of the image's weighted moments.
@@ -115,21 +115,21 @@ kernel void wide_columns(
     if (i >= columns || j >= rows || view >= views)
         return;
     const ulong at = ((ulong)view * rows + j) * stride + MARGIN + i;
-    floatn sum = 0.0f, moment_u = 0.0f, moment_v = 0.0f;
+    real sum = 0.0f, moment_u = 0.0f, moment_v = 0.0f;
     for (int k = -radius; k <= radius; ++k) {
         const float tap = taps[k + radius];
-        const floatn value = tap * load_unaligned(zeroth + at + k);
+        const real value = tap * load_global(zeroth + at + k);
         sum += value;
         moment_u += k * value;
-        moment_v += tap * load_unaligned(first + at + k);
+        moment_v += tap * load_global(first + at + k);
     }
     fit += (ulong)j * stride + MARGIN + i;
     const ulong plane = (ulong)rows * stride;
-    const floatn share = load_unaligned(fit);
-    const floatn value = share * sum + load_unaligned(fit + plane) * moment_u +
-                         load_unaligned(fit + 2 * plane) * moment_v;
+    const real share = load_global(fit);
+    const real value = share * sum + load_global(fit + plane) * moment_u +
+                         load_global(fit + 2 * plane) * moment_v;
     // Beyond the line stays 0, also of images that are not finite: the next ones read it.
-    store_unaligned(select((floatn)0.0f, value, share != 0.0f), wide + at);
+    store_global(select((real)0.0f, value, share != 0.0f), wide + at);
 }
 
 // Cubic B-spline through coarse columns, at every fine column, in the coarse rows. LANES columns
@@ -160,10 +160,10 @@ kernel void expand_columns(
     const ulong line = (ulong)view * coarse_rows + j;
     global const float *from = coarse + line * coarse_stride + MARGIN;
     const int base = bases[get_global_id(0)];
-    floatn sum = 0.0f;
+    real sum = 0.0f;
     for (int k = 0; k < span; ++k)
-        sum += from[base + k] * load_unaligned(weights + (ulong)k * stride + MARGIN + i);
-    store_unaligned(sum, expanded + line * stride + MARGIN + i);
+        sum += from[base + k] * load_global(weights + (ulong)k * stride + MARGIN + i);
+    store_global(sum, expanded + line * stride + MARGIN + i);
 }
 
 // Vertical convolution of the masked image with h; what lies beyond the first and last row is 0.
@@ -192,15 +192,15 @@ kernel void narrow_rows(
         return;
     image += ((ulong)view * rows + j) * columns + i;
     mask += (ulong)j * stride + MARGIN + i;
-    floatn sum = 0.0f;
+    real sum = 0.0f;
     for (int k = -min(radius, j); k <= min(radius, rows - 1 - j); ++k) {
         global const float *from = image + (long)k * columns;
-        floatn value = load_columns(from, columns - i);
+        real value = load_columns(from, columns - i);
         if (masked)
-            value = select((floatn)0.0f, value, load_unaligned(mask + (long)k * stride) > 0.0f);
+            value = select((real)0.0f, value, load_global(mask + (long)k * stride) > 0.0f);
         sum += taps[k + radius] * value;
     }
-    store_unaligned(sum, blurred + ((ulong)view * rows + j) * stride + MARGIN + i);
+    store_global(sum, blurred + ((ulong)view * rows + j) * stride + MARGIN + i);
 }
 
 // Horizontal convolution with h, times the reciprocal of the mask's, minus the wide part, brought
@@ -233,10 +233,10 @@ kernel void bandpass_columns(
     if (i >= columns || j >= rows || view >= views)
         return;
     const ulong at = ((ulong)view * rows + j) * stride + MARGIN + i;
-    const floatn s = load_unaligned(scale + (ulong)j * stride + MARGIN + i);
-    floatn value = 0.0f;
+    const real s = load_global(scale + (ulong)j * stride + MARGIN + i);
+    real value = 0.0f;
     for (int k = -radius; k <= radius; ++k)
-        value += taps[k + radius] * load_unaligned(image + at + k);
+        value += taps[k + radius] * load_global(image + at + k);
     value *= s;
 
     const float y = (j - 0.5f * (factor - 1)) / factor + RIM;
@@ -245,10 +245,10 @@ kernel void bandpass_columns(
     spline_weights(y - base, w);
     expanded += ((ulong)view * coarse_rows + base - 1) * stride + MARGIN + i;
     for (int k = 0; k < 4; ++k)
-        value -= w[k] * load_unaligned(expanded + (ulong)k * stride);
-    value = select((floatn)0.0f, value, s > 0.0f);
+        value -= w[k] * load_global(expanded + (ulong)k * stride);
+    value = select((real)0.0f, value, s > 0.0f);
     coefficients += at;
-    store_unaligned(value, coefficients);
+    store_global(value, coefficients);
     // The border goes on for the one column that the spline at the outermost pixels reaches.
     if (i == 0)
         coefficients[-1] = coefficients[0];
@@ -274,15 +274,15 @@ kernel void spline_values(
     const int i = get_global_id(0) * LANES, j = get_global_id(1), view = get_global_id(2);
     if (i >= columns || j >= rows || view >= views)
         return;
-    floatn side = 0.0f, middle = 0.0f;
+    real side = 0.0f, middle = 0.0f;
     for (int k = -1; k <= 1; ++k) {
         const int y = clamp(j + k, 0, rows - 1);
         global const float *p = coefficients + ((ulong)view * rows + y) * stride + MARGIN + i;
         const float weight = k ? 1.0f / 6.0f : 2.0f / 3.0f;
-        middle += weight * load_unaligned(p);
-        side += weight * (load_unaligned(p - 1) + load_unaligned(p + 1));
+        middle += weight * load_global(p);
+        side += weight * (load_global(p - 1) + load_global(p + 1));
     }
-    const floatn value = (2.0f / 3.0f) * middle + (1.0f / 6.0f) * side;
+    const real value = (2.0f / 3.0f) * middle + (1.0f / 6.0f) * side;
     values += ((ulong)view * rows + j) * values_stride + values_lead + i;
     store_columns(value, values, columns - i);
 }

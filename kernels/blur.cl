@@ -1,10 +1,10 @@
-// Gaussian blur of lined images (see lanes.clh), one direction a kernel.
+// Gaussian blur of lined images (see vectors.clh), one direction a kernel.
 //
 // Beyond the border there is nothing: what is left of the taps on the detector is scaled up to 1. A
 // work-item makes LANES columns of one row; global size (blocks of LANES columns, rows, views),
 // rounded up at will.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 // Along the direction of rows (vertical).
 kernel void blur_rows(
@@ -27,13 +27,13 @@ kernel void blur_rows(
     if (i >= columns || j >= rows || view >= views)
         return;
     const ulong at = ((ulong)view * rows + j) * stride + MARGIN + i;
-    floatn sum = 0.0f;
+    real sum = 0.0f;
     float part = 0.0f;
     for (int k = -min(radius, j); k <= min(radius, rows - 1 - j); ++k) {
-        sum += taps[k + radius] * load_unaligned(image + at + (long)k * stride);
+        sum += taps[k + radius] * load_global(image + at + (long)k * stride);
         part += taps[k + radius];
     }
-    store_unaligned(sum / part, blurred + at);
+    store_global(sum / part, blurred + at);
 }
 
 // Along the direction of columns (horizontal); radius <= MARGIN.
@@ -60,8 +60,8 @@ kernel void blur_columns(
     if (i >= columns || j >= rows || view >= views)
         return;
     const ulong at = ((ulong)view * rows + j) * stride + MARGIN + i;
-    floatn sum = 0.0f;
+    real sum = 0.0f;
     for (int k = -radius; k <= radius; ++k)
-        sum += taps[k + radius] * load_unaligned(image + at + k);
-    store_unaligned(sum * load_unaligned(part + MARGIN + i), blurred + at);
+        sum += taps[k + radius] * load_global(image + at + k);
+    store_global(sum * load_global(part + MARGIN + i), blurred + at);
 }

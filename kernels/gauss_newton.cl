@@ -11,7 +11,7 @@
 // and moves on). Coordinates are pixels from the centre of the first; c is the detector's centre.
 // `state` keeps STATE floats a view, see gauss_newton.clh.
 
-#include "lanes.clh"
+#include "vectors.clh"
 #include "gauss_newton.clh"
 
 // Start of every view: the coarse shift or none; views without signal are done at once.

@@ -7,7 +7,7 @@
 #define LANES 1
 #endif
 
-#include "unaligned.clh"
+#include "vectors.clh"
 #include "gauss_newton.clh"
 
 // Weights of the cubic B-spline's four coefficients around a point f past the second, e = 1 - f,
@@ -47,18 +47,18 @@ typedef struct {
 // The spline and its derivatives along x and y, u and f past the second of four by four
 // coefficients, whose first are those of column x - 1 and row y - 1.
 __attribute__((always_inline)) static inline void
-spline_at(const counterparts s, const int x, const int y, const floatn u, const float f, floatn *b,
-          floatn *p, floatn *q)
+spline_at(const counterparts s, const int x, const int y, const real u, const float f, real *b,
+          real *p, real *q)
 {
     *b = *p = *q = 0.0f;
 #if GROUP == 1
     const float wy[4] = SPLINE(f, 1.0f - f), sy[4] = SPLINE_SLOPE(f, 1.0f - f);
-    const floatn wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
+    const real wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
     for (int k = 0; k < 4; ++k) {
-        floatn value = 0.0f, slope = 0.0f;
+        real value = 0.0f, slope = 0.0f;
         for (int l = 0; l < 4; ++l) {
             const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
-            const floatn c = load_unaligned(s.coefficients + line + k);
+            const real c = load_global(s.coefficients + line + k);
             value += wy[l] * c;
             slope += sy[l] * c;
         }
@@ -90,8 +90,8 @@ spline_at(const counterparts s, const int x, const int y, const floatn u, const 
 // spline's piece under its middle: in the outer ones the point lies up to LANES/2 |1/m - 1| beyond
 // the knot, where the piece differs from its neighbour by the cube of that only. So no lane loads
 // from an address of its own.
-__attribute__((always_inline)) static inline floatn
-terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
+__attribute__((always_inline)) static inline real
+terms_at(const counterparts s, const int j, const int i, real term[TERMS])
 {
     const float2 centre = 0.5f * (float2)(s.columns - 1, s.rows - 1);
     // Displacements, not positions, are interpolated at: they keep all their digits.
@@ -103,11 +103,11 @@ terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
         (i + 0.5f * (LANES - 1) - centre.x) * s.growth - s.shift.x * (1.0f + s.growth);
     // Far outside the detector all is 0 anyway.
     const int x = clamp(i + (int)floor(middle), -LANES - 4, s.columns + 3);
-    const floatn lanes = load_lanes(lane_numbers);
-    const floatn u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * s.growth;
-    floatn b, p, q;
+    const real lanes = RAMP;
+    const real u = middle - floor(middle) + (lanes - 0.5f * (LANES - 1)) * s.growth;
+    real b, p, q;
     spline_at(s, x, y, u, f, &b, &p, &q);
-    const floatn distance_u = (i - centre.x - s.shift.x + lanes) * (1.0f + s.growth);
+    const real distance_u = (i - centre.x - s.shift.x + lanes) * (1.0f + s.growth);
     term[0] = p;
     term[1] = q;
     term[2] = (p * distance_u + q * distance_v) * s.inverse_radius;
@@ -116,8 +116,8 @@ terms_at(const counterparts s, const int j, const int i, floatn term[TERMS])
     const int near = x + (middle - floor(middle) >= 0.5f);
     const int line = clamp(nearest, 0, s.rows - 1) * s.stride + MARGIN;
     const float used = nearest >= 0 && nearest < s.rows;
-    return used * load_unaligned(s.window + j * s.stride + MARGIN + i) *
-           load_unaligned(s.valid + line + near);
+    return used * load_global(s.window + j * s.stride + MARGIN + i) *
+           load_global(s.valid + line + near);
 }
 
 // Sums of the normal equations over blocks of rows. Work-group (GROUP, 1, 1), global size
@@ -168,18 +168,18 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
         inverse_radius};
     const int start = top + block * block_rows, stop = min(bottom, start + block_rows);
     sums += sums_offset + ((ulong)view * get_global_size(1) + block) * SUMS;
-    floatn term[TERMS];
+    real term[TERMS];
 #if GROUP == 1
-    floatn sum[SUMS];
+    real sum[SUMS];
     for (int k = 0; k < SUMS; ++k)
         sum[k] = 0.0f;
     for (int j = start; j < stop; ++j)
         for (int i = left; i < right; i += LANES) {
-            const floatn w = terms_at(s, j, i, term);
+            const real w = terms_at(s, j, i, term);
             for (int k = 0; k < BLURS; ++k)
-                term[5 + k] = load_unaligned(s.measured + k * s.blur + j * stride + MARGIN + i);
+                term[5 + k] = load_global(s.measured + k * s.blur + j * stride + MARGIN + i);
             for (int k = 0, at = 0; k < TERMS; ++k) {
-                const floatn weighted = w * term[k];
+                const real weighted = w * term[k];
                 for (int other = k; other < TERMS; ++other, ++at)
                     sum[at] += weighted * term[other];
             }

@@ -6,12 +6,12 @@
 // normal. A work-item makes LANES columns of one line. Global sizes are (blocks of LANES columns,
 // lines, views), rounded up at will.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 // Linear interpolation across lines, `stride` apart, at a position of its own for each column.
 // Positions of neighbouring columns are near each other: all lines among them are read whole.
-static inline floatn across_lines(
-    global const float *lines, const int stride, const floatn position, const int count)
+static inline real across_lines(
+    global const float *lines, const int stride, const real position, const int count)
 {
     float at[LANES];
     store_lanes(position, at);
@@ -20,9 +20,9 @@ static inline floatn across_lines(
         low = at[k] < low ? at[k] : low;
         high = at[k] > high ? at[k] : high;
     }
-    floatn sum = 0.0f;
+    real sum = 0.0f;
     for (int line = (int)low; line < high + 1.0f; ++line) {
-        const floatn weight = fmax(1.0f - fabs(position - (float)line), 0.0f);
+        const real weight = fmax(1.0f - fabs(position - (float)line), 0.0f);
         sum += weight * load_columns(lines + (ulong)line * stride, count);
     }
     return sum;
@@ -55,16 +55,16 @@ kernel void differentiate(
     global const float *p = projections + ((ulong)view * rows + first + row) * columns + i;
     global const float *q = p + (ulong)rows * columns;
     // p before and q after, by row and column
-    const floatn p00 = load_columns(p, count), p01 = load_columns(p + 1, count);
-    const floatn p10 = load_columns(p + columns, count), p11 = load_columns(p + columns + 1, count);
-    const floatn q00 = load_columns(q, count), q01 = load_columns(q + 1, count);
-    const floatn q10 = load_columns(q + columns, count), q11 = load_columns(q + columns + 1, count);
-    const floatn left = (p00 + q00) + (p10 + q10), right = (p01 + q01) + (p11 + q11);
-    const floatn low = (p00 + q00) + (p01 + q01), high = (p10 + q10) + (p11 + q11);
-    const floatn before = (p00 + p01) + (p10 + p11), after = (q00 + q01) + (q10 + q11);
-    const floatn u = (i + 0.5f - principal_column + load_lanes(lane_numbers)) * step_u;
+    const real p00 = load_columns(p, count), p01 = load_columns(p + 1, count);
+    const real p10 = load_columns(p + columns, count), p11 = load_columns(p + columns + 1, count);
+    const real q00 = load_columns(q, count), q01 = load_columns(q + 1, count);
+    const real q10 = load_columns(q + columns, count), q11 = load_columns(q + columns + 1, count);
+    const real left = (p00 + q00) + (p10 + q10), right = (p01 + q01) + (p11 + q11);
+    const real low = (p00 + q00) + (p01 + q01), high = (p10 + q10) + (p11 + q11);
+    const real before = (p00 + p01) + (p10 + p11), after = (q00 + q01) + (q10 + q11);
+    const real u = (i + 0.5f - principal_column + RAMP) * step_u;
     const float v = (first + row + 0.5f - principal_row) * step_v;
-    const floatn sum = (after - before) * (0.25f / angle_step) +
+    const real sum = (after - before) * (0.25f / angle_step) +
                        (1.0f + u * u) * (right - left) * (0.25f / step_u) +
                        u * v * (high - low) * (0.25f / step_v);
     out += ((ulong)view * height + row) * (columns - 1) + i;
@@ -92,11 +92,11 @@ kernel void take_lines(
     const int i = get_global_id(0) * LANES, line = get_global_id(1), view = get_global_id(2);
     if (i >= padded || line >= count || view >= views)
         return;
-    floatn value = 0.0f;
+    real value = 0.0f;
     if (i < width) {
         const int valid = min(LANES, width - i);
-        const floatn row = position[2 * line] +
-                           position[2 * line + 1] * (i + load_lanes(lane_numbers));
+        const real row = position[2 * line] +
+                           position[2 * line + 1] * (i + RAMP);
         value = across_lines(
             image + (ulong)view * height * width + i,
             width,
@@ -130,8 +130,8 @@ kernel void put_lines(
     if (i >= columns || row >= rows || view >= views)
         return;
     const int valid = min(LANES, columns - i);
-    const floatn at = load_unaligned(position + (ulong)row * stride + i);
-    const floatn value =
+    const real at = load_global(position + (ulong)row * stride + i);
+    const real value =
         across_lines(lines + (ulong)view * count * padded + i, padded, at, valid);
     store_columns(value, out + ((ulong)view * rows + row) * columns + i, valid);
 }

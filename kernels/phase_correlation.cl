@@ -4,7 +4,7 @@
 // correlation map of a measured and a simulated image has its peak at the shift (u, v) that takes
 // the simulated image to the measured one, negative shifts at the far ends.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 #ifndef GROUP
 #define GROUP 1 // work-items that share a view: 1 on CPUs, 64 on GPUs; a power of two
@@ -184,10 +184,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void peak(
     shifts[2 * view + 1] = (v + dv) * pixel;
 }
 
-// LANES columns, two apart; not by a vector of 16, see lanes.clh
-static inline floatn every_second(global const float *restrict p)
+// LANES columns, two apart; not by a vector of 16, see vectors.clh
+static inline real every_second(global const float *restrict p)
 {
-    return (floatn)(load_unaligned(p).even, load_unaligned(p + LANES).even);
+    return (real)(load_global(p).even, load_global(p + LANES).even);
 }
 
 // Windowed, halved images for the coarse search: the spline midway between four pixels.
@@ -214,7 +214,7 @@ kernel void halve(
     const int i = get_global_id(0) * LANES, j = get_global_id(1), view = get_global_id(2);
     if (i >= out_columns || j >= out_rows || view >= views)
         return;
-    floatn sum = 0.0f;
+    real sum = 0.0f;
     if (i < columns / 2 && j < rows / 2) {
         const float weights[4] = {1.0f / 48.0f, 23.0f / 48.0f, 23.0f / 48.0f, 1.0f / 48.0f};
         for (int k = 0; k < 4; ++k) {
@@ -224,11 +224,11 @@ kernel void halve(
             sum += weights[k] * (weights[0] * (every_second(p) + every_second(p + 3)) +
                                  weights[1] * (every_second(p + 1) + every_second(p + 2)));
         }
-        sum *= load_unaligned(window + (ulong)j * window_stride + MARGIN + i);
+        sum *= load_global(window + (ulong)j * window_stride + MARGIN + i);
     }
     halved += ((ulong)view * out_rows + j) * out_columns + i;
     if (out_columns - i >= LANES)
-        store_unaligned(sum, halved);
+        store_global(sum, halved);
     else
         store_some(sum, halved, out_columns - i);
 }

@@ -15,7 +15,10 @@
 // z. A work-item sums BLOCK voxels along z over the given views. Global sizes are
 // (blocks, strip, ny ceil(nx / strip)), rounded up at will.
 
-#include "geometry.clh"
+#ifndef LANES
+#define LANES 1 // 1, 8 or 16
+#endif
+
 #include "pieces.clh"
 
 #ifndef BLOCK

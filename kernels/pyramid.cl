@@ -10,13 +10,13 @@
 // (prolongation). Global sizes are (blocks of LANES coarse columns, rows, planes) of the output,
 // rounded up at will.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 // p[0] + p[1], p[2] + p[3], ...
-static inline floatn pair_sums(global const float *p)
+static inline real pair_sums(global const float *p)
 {
-    const floatn a = load_unaligned(p), b = load_unaligned(p + LANES);
-    return (floatn)(a.even + a.odd, b.even + b.odd);
+    const real a = load_global(p), b = load_global(p + LANES);
+    return (real)(a.even + a.odd, b.even + b.odd);
 }
 
 kernel void restrict_2d(
@@ -39,7 +39,7 @@ kernel void restrict_2d(
     fine += ((ulong)k * fine_rows + 2 * j) * fine_columns + 2 * i;
     global const float *next = fine + fine_columns;
     if (i + LANES <= columns) {
-        store_unaligned(0.25f * (pair_sums(fine) + pair_sums(next)), coarse);
+        store_global(0.25f * (pair_sums(fine) + pair_sums(next)), coarse);
         return;
     }
     for (int c = 0; c < columns - i; ++c)
@@ -68,9 +68,9 @@ kernel void restrict_3d(
     global const float *below = fine + (ulong)fine_rows * fine_columns;
     global const float *both = below + fine_columns;
     if (i + LANES <= columns) {
-        const floatn sum =
+        const real sum =
             pair_sums(fine) + pair_sums(right) + (pair_sums(below) + pair_sums(both));
-        store_unaligned(0.125f * sum, coarse);
+        store_global(0.125f * sum, coarse);
         return;
     }
 // A few columns at the end: made vectors of, they would take a GPU's registers.
@@ -89,16 +89,16 @@ static inline int neighbour(const int i, const int size)
 }
 
 // LANES coarse columns at p of the row that lies between the four given ones
-static inline floatn mixed(
+static inline real mixed(
     global const float *near,
     global const float *near_row,
     global const float *near_plane,
     global const float *far,
     const int at)
 {
-    return 0.5625f * load_unaligned(near + at)
-           + 0.1875f * (load_unaligned(near_row + at) + load_unaligned(near_plane + at))
-           + 0.0625f * load_unaligned(far + at);
+    return 0.5625f * load_global(near + at)
+           + 0.1875f * (load_global(near_row + at) + load_global(near_plane + at))
+           + 0.0625f * load_global(far + at);
 }
 
 kernel void prolong_3d(
@@ -125,16 +125,16 @@ kernel void prolong_3d(
     global const float *a = plane0 + (ulong)j0 * columns, *b = plane0 + (ulong)j1 * columns;
     global const float *c = plane1 + (ulong)j0 * columns, *d = plane1 + (ulong)j1 * columns;
     if (i > 0 && i + LANES < columns) {
-        const floatn own = 0.75f * mixed(a, b, c, d, i);
-        const floatn even = own + 0.25f * mixed(a, b, c, d, i - 1);
-        const floatn odd = own + 0.25f * mixed(a, b, c, d, i + 1);
-        floatn low, high;
+        const real own = 0.75f * mixed(a, b, c, d, i);
+        const real even = own + 0.25f * mixed(a, b, c, d, i - 1);
+        const real odd = own + 0.25f * mixed(a, b, c, d, i + 1);
+        real low, high;
         low.even = even.lo;
         low.odd = odd.lo;
         high.even = even.hi;
         high.odd = odd.hi;
-        store_unaligned(low, fine);
-        store_unaligned(high, fine + LANES);
+        store_global(low, fine);
+        store_global(high, fine + LANES);
         return;
     }
     const int last = min(fine_columns - 2 * i, 2 * LANES);

@@ -8,7 +8,7 @@
 // Lines are numbered through all views: line = view * rows + row. A work-item makes LANES columns
 // of one line. Global sizes are (blocks of LANES columns, lines), rounded up at will.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 #define VIEW_FIELDS 6 // c0, r0 [pixel], a, b, s [1/pixel^2], factor [1/mm]
 
@@ -23,9 +23,9 @@ static inline float weight_at(const LineWeight w, const int i)
 }
 
 // of LANES neighbouring columns from column i on
-static inline floatn weights_at(const LineWeight w, const int i)
+static inline real weights_at(const LineWeight w, const int i)
 {
-    const floatn du = (i - w.c0) + load_lanes(lane_numbers);
+    const real du = (i - w.c0) + RAMP;
     return w.factor / sqrt(w.quadratic + du * (w.linear + w.a * du));
 }
 
@@ -67,14 +67,14 @@ kernel void weight_lines(
     lines += (ulong)line * padded + i;
 
     if (i + LANES <= columns) {
-        store_unaligned(load_unaligned(p + i) * weights_at(w, i), lines);
+        store_global(load_global(p + i) * weights_at(w, i), lines);
         return;
     }
     // From here on columns lie left of the detector rather than right of it.
     const int middle = columns + (padded - columns) / 2;
     if (i >= columns && i + LANES <= padded && (i + LANES <= middle || i >= middle)) {
         const int from = i < middle ? columns - 1 : 0;
-        store_unaligned(p[from] * weight_at(w, from) * load_unaligned(roll + i - columns), lines);
+        store_global(p[from] * weight_at(w, from) * load_global(roll + i - columns), lines);
         return;
     }
     const int last = min(LANES, padded - i);
@@ -102,7 +102,7 @@ kernel void cut_lines(
     filtered += (ulong)(first + line) * columns + i;
     lines += (ulong)line * padded + i;
     if (i + LANES <= columns) {
-        store_unaligned(load_unaligned(lines), filtered);
+        store_global(load_global(lines), filtered);
         return;
     }
     for (int k = 0; k < columns - i; ++k)

@@ -12,7 +12,7 @@
 // will. "Lined" images (views, rows, stride) have MARGIN columns before and after each line, here
 // with its mirror image; a line takes the columns rounded up to a multiple of 16.
 
-#include "unaligned.clh"
+#include "vectors.clh"
 
 #define TAPS 14 // on each side, <= MARGIN: the next is 1e-8 of the first
 
@@ -70,23 +70,23 @@ kernel void prefilter_rows(
         }
         return;
     }
-    floatn sum = taps[0] * load_unaligned(image + (ulong)j * columns);
+    real sum = taps[0] * load_global(image + (ulong)j * columns);
     if (j >= TAPS && j + TAPS < rows) {
         global const float *above = image + (ulong)j * columns, *below = above;
 #pragma unroll 4 // all 14 would take a GPU's registers
         for (int k = 1; k <= TAPS; ++k) {
             above -= columns;
             below += columns;
-            sum += taps[k] * (load_unaligned(above) + load_unaligned(below));
+            sum += taps[k] * (load_global(above) + load_global(below));
         }
     } else {
         for (int k = 1; k <= TAPS; ++k) {
             global const float *above = image + (ulong)mirrored(j - k, rows) * columns;
             global const float *below = image + (ulong)mirrored(j + k, rows) * columns;
-            sum += taps[k] * (load_unaligned(above) + load_unaligned(below));
+            sum += taps[k] * (load_global(above) + load_global(below));
         }
     }
-    store_unaligned(sum, coefficients);
+    store_global(sum, coefficients);
 }
 
 // Global size (blocks of LANES columns of a whole lined row, rows, views).
@@ -119,10 +119,10 @@ kernel void resample_rows(
         line[k] = coefficients + (ulong)mirrored(base - 1 + k, rows) * columns;
     const int i = x - MARGIN;
     if (i >= 0 && i + LANES <= columns) {
-        floatn sum = w[0] * load_unaligned(line[0] + i);
+        real sum = w[0] * load_global(line[0] + i);
         for (int k = 1; k < 4; ++k)
-            sum += w[k] * load_unaligned(line[k] + i);
-        store_unaligned(sum, resampled);
+            sum += w[k] * load_global(line[k] + i);
+        store_global(sum, resampled);
         return;
     }
     for (int c = 0; c < LANES; ++c) {
@@ -151,9 +151,9 @@ kernel void prefilter_columns(
     if (i >= columns || j >= rows || view >= views)
         return;
     image += ((ulong)view * rows + j) * stride + MARGIN + i;
-    floatn sum = taps[0] * load_unaligned(image);
+    real sum = taps[0] * load_global(image);
     for (int k = 1; k <= TAPS; ++k)
-        sum += taps[k] * (load_unaligned(image - k) + load_unaligned(image + k));
+        sum += taps[k] * (load_global(image - k) + load_global(image + k));
     store_columns(sum, coefficients + ((ulong)view * rows + j) * columns + i, columns - i);
 }
 
@@ -184,14 +184,14 @@ kernel void resample_columns(
     const int end = position(last, columns, shift, magnification, &fraction);
     if (end - base == LANES - 1 && base >= 1 && end + 2 < columns) {
         // Magnifications are near 1: neighbours nearly always have neighbouring coefficients.
-        const floatn centred = i + load_lanes(lane_numbers) - 0.5f * (columns - 1);
-        const floatn f = (magnification - 1.0f) * centred + (shift - (base - i)), g = 1.0f - f;
+        const real centred = i + RAMP - 0.5f * (columns - 1);
+        const real f = (magnification - 1.0f) * centred + (shift - (base - i)), g = 1.0f - f;
         global const float *c = coefficients + base;
-        floatn sum = g * g * g * (1.0f / 6.0f) * load_unaligned(c - 1);
-        sum += ((2.0f / 3.0f) - f * f * (1.0f - 0.5f * f)) * load_unaligned(c);
-        sum += ((2.0f / 3.0f) - g * g * (1.0f - 0.5f * g)) * load_unaligned(c + 1);
-        sum += f * f * f * (1.0f / 6.0f) * load_unaligned(c + 2);
-        store_unaligned(sum, resampled);
+        real sum = g * g * g * (1.0f / 6.0f) * load_global(c - 1);
+        sum += ((2.0f / 3.0f) - f * f * (1.0f - 0.5f * f)) * load_global(c);
+        sum += ((2.0f / 3.0f) - g * g * (1.0f - 0.5f * g)) * load_global(c + 1);
+        sum += f * f * f * (1.0f / 6.0f) * load_global(c + 2);
+        store_global(sum, resampled);
         return;
     }
     for (int x = i; x <= last; ++x) {

@@ -9,6 +9,7 @@ import pytest
 
 from clra.errors import DeviceError
 from clra.ops.runtime import build, devices
+from clra.ops.runtime.profile import DeviceProfile, forced
 
 TESTS = Path(__file__).parent
 # Folders whose tests run kernels.
@@ -61,6 +62,13 @@ def unordered(context: cl.Context) -> cl.CommandQueue:
     """A queue that runs what it holds in any order that events allow."""
     flag = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
     return cl.CommandQueue(context, properties=flag)
+
+
+@pytest.fixture
+def form(request: pytest.FixtureRequest) -> Iterator[DeviceProfile]:
+    """Give every device the profile that a test is parametrised with."""
+    with forced(request.param):
+        yield request.param
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """The projectors' geometries and forms, and how tests call them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -9,15 +10,24 @@ from geometries import upside_down
 
 from clra import ConeBeamGeometry, Motion, VolumeGrid, circular, helix, space_filling
 from clra.ops.projection.projector import BackProjector, ForwardProjector
+from clra.ops.runtime.profile import CPU, GPU, WIDE_CPU
 
 ROUNDING = 2e-5  # of the largest value: float32 along a line of some tens of samples
 
-# The form for columns where views allow it; the general one, vectorised; the one for GPUs.
-FORMS = {"columns": {}, "tilted": {"_tilted": True}, "gpu": {"_lanes": 1}}
-forms = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+# The kernels for v parallel to z, where views allow them, and those for any pose.
+FORMS = {
+    "columns": WIDE_CPU,
+    "tilted": replace(WIDE_CPU, columns=False),
+    "gpu": GPU,
+    "gpu tilted": replace(GPU, columns=False),
+}
 # Vectors of eight, which only CPUs without AVX-512 take by themselves.
-NARROW = {"narrow columns": {"_lanes": 8}, "narrow tilted": {"_lanes": 8, "_tilted": True}}
-all_forms = pytest.mark.parametrize("form", [*FORMS.values(), *NARROW.values()], ids=FORMS | NARROW)
+NARROW = {"narrow columns": CPU, "narrow tilted": replace(CPU, columns=False)}
+# A test that asks for `form` runs with the device's profile so forced, see conftest.py.
+forms = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS, indirect=True)
+all_forms = pytest.mark.parametrize(
+    "form", [*FORMS.values(), *NARROW.values()], ids=FORMS | NARROW, indirect=True
+)
 
 DETECTOR = {
     "source_to_axis": 60.0,
@@ -79,6 +89,7 @@ GEOMETRIES = {
     "little tilt": perturbed(circular(6, **DETECTOR), 0.1),
     "tilted": perturbed(helix(6, angle_step=1.1, z_step=1.3, **DETECTOR), 1.0),
     "from above": from_above(4),
+    "wide cone": circular(4, start=0.2, **DETECTOR | {"shape": (120, 9)}),
 }
 geometries = pytest.mark.parametrize("geometry", GEOMETRIES.values(), ids=GEOMETRIES)
 

@@ -99,6 +99,16 @@ def test_libraries_stay_on_their_floors(floor, library):
             assert name.split(".")[0] != library, path
 
 
+def test_one_module_tells_cpus_from_gpus():
+    # devices lists kinds and self_test gives advice; what runs is the profile's choice.
+    asking = {
+        path.stem
+        for path in modules()
+        if re.search(r"is_cpu|device_type\.CPU", path.read_text(encoding="utf-8"))
+    }
+    assert asking <= {"profile", "devices", "self_test"}
+
+
 def test_files_are_short():
     files = [*modules(), *(ROOT / "kernels").glob("*.cl*"), *(ROOT / "tools").glob("*.py")]
     long = {path.name: n for path in files if (n := path.read_text().count("\n")) > MOST_LINES}

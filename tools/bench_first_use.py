@@ -11,7 +11,7 @@ from pathlib import Path
 from bench_cases import Bench, Value
 
 _FIRST_USE = """
-import math, time
+import dataclasses, math, time
 import numpy as np
 import clra
 geometry = clra.circular(16, source_to_axis=100.0, source_to_detector=150.0, pixel_size=0.6,
@@ -26,7 +26,7 @@ print(time.perf_counter() - start, time.process_time())
 """
 # Every method and form of the projectors: what it builds are all kernels.
 _ALL = """
-import math, time
+import dataclasses, math, time
 import numpy as np
 import pyopencl as cl
 import pyopencl.array
@@ -35,6 +35,7 @@ from clra.ops.runtime.devices import create_context
 random = np.random.default_rng(0)
 geometry = clra.circular(16, source_to_axis=100.0, source_to_detector=150.0, pixel_size=0.6,
                          shape=(64, 64))
+tilted = dataclasses.replace(geometry, v=geometry.v + 0.1 * geometry.u)
 scan = clra.Scan(random.random((16, 64, 64), np.float32), geometry)
 grid = clra.VolumeGrid(shape=(32, 32, 32), voxel_size=0.5)
 helix = clra.helix(200, angle_step=math.radians(5), z_step=0.1, source_to_axis=100.0,
@@ -49,10 +50,10 @@ clra.reconstruct(turns, method="katsevich", grid=clra.VolumeGrid(shape=(9, 32, 3
 queue = cl.CommandQueue(create_context(None))
 projections = cl.array.zeros(queue, (16, 64, 64), np.float32)
 volume = cl.array.zeros(queue, grid.shape, np.float32)
-for tilted in False, True:
-    clra.ForwardProjector(queue.context, geometry, grid, _tilted=tilted)(queue, projections, volume)
+for views in geometry, tilted:
+    clra.ForwardProjector(queue.context, views, grid)(queue, projections, volume)
     for matched in False, True:
-        clra.BackProjector(queue.context, geometry, grid, matched=matched, _tilted=tilted)(
+        clra.BackProjector(queue.context, views, grid, matched=matched)(
             queue, volume, projections
         ).wait()
 print(time.perf_counter() - start, time.process_time())

@@ -8,14 +8,11 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reprojection import band_of, with_margin
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.ops.projection.layout import view_elements
 from clra.ops.registration.gauss_newton import pair_bytes
 from clra.ops.runtime.lines import line_stride
 from clra.ops.streaming.memory import Budgets
 
-# Bytes that operators use between their kernels where a budget leaves them, on CPUs and elsewhere.
-_PROJECTOR = {True: 24 << 20, False: 256 << 20}
-_FILTER = {True: 8 << 20, False: 16 << 20}
-_REGISTRATION = {True: 128 << 20, False: 512 << 20}
 # Bytes for an element of the windows and masks in registration.
 _WINDOW = 16
 # Radiographs read at a time, as parts of a chunk: two in flight, and while one is converted and
@@ -77,7 +74,7 @@ def reconstruction_need(
     views, (rows, columns), shared = geometry.views, geometry.shape, budgets.shared
     chunk = _chunk(budgets, geometry)
     padded = 4 * 2 * columns
-    filtering = min(_limited(_FILTER[shared], budgets), padded * rows * views)
+    filtering = min(_limited(budgets.profile.filter_bytes, budgets), padded * rows * views)
     if lines > 1:
         filtering = max(filtering, lines * rows * padded)
     coarse = grid.shape[0] / 4 * grid.shape[1] / 8 * grid.shape[2] / 8
@@ -152,7 +149,7 @@ def _registering_need(
     chunk = _chunk(budgets, geometry)
     lined = geometry.rows * line_stride(geometry.columns)
     pair = pair_bytes(geometry.shape, band_of(geometry.shape)[1])
-    pairs = max(1, _limited(_REGISTRATION[shared], budgets, 3) // pair)
+    pairs = max(1, _limited(budgets.profile.registration_bytes, budgets, 3) // pair)
     pairs = min(pairs, chunk // (4 * pixels))
     registering = (
         _projecting(budgets, geometry, chunk)
@@ -200,7 +197,6 @@ def _slab(budgets: Budgets, grid: VolumeGrid, volumes: int = 1) -> int:
 
 def _projecting(budgets: Budgets, geometry: ConeBeamGeometry, chunk: int) -> int:
     """Bytes of padded lines in a projector."""
-    rows, columns = geometry.shape
-    view = 4 * (columns + 1) * (rows + 56)
-    most = max(1, _limited(_PROJECTOR[budgets.shared], budgets) // view)
-    return view * min(most, max(1, chunk // (4 * rows * columns)))
+    view, pixels = 4 * view_elements(geometry.shape), 4 * int(np.prod(geometry.shape))
+    most = max(1, _limited(budgets.profile.projector_bytes, budgets) // view)
+    return view * min(most, max(1, chunk // pixels))

@@ -15,11 +15,8 @@ from clra.ops.projection.coverage import Coverage
 from clra.ops.projection.layout import volume_shape
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-
-# Radiographs between two operations at a time; large enough for the launches to cost nothing.
-_CPU_BYTES, _GPU_BYTES = 32 << 20, 256 << 20
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, within
+from clra.ops.runtime.profile import profile_of
 
 
 class AlignmentStep:
@@ -91,8 +88,7 @@ class AlignmentStep:
         self._shape = (geometry.views, *geometry.shape)
         weights = taper(geometry.rows, FADE) if row_weight is None else row_weight
         memory = Scratch(context, allocator)
-        cpu = build.is_cpu(build.device_of(context))
-        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
+        most = within(profile_of(context).step_bytes, scratch_limit)
         views = min(geometry.views, max(1, most // (4 * geometry.rows * geometry.columns)))
         within_limits: dict[str, Any] = {"allocator": memory, "scratch_limit": scratch_limit}
         self._between = memory.empty((views, *geometry.shape))
@@ -177,16 +173,16 @@ class AlignmentStep:
         TypeError, InputError
             If an argument is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         views = self._shape[0]
         for name, array, shape in (
             ("estimates_out", estimates_out, (views, len(ESTIMATE_FIELDS))),
             ("volume_out", volume_out, self._volume_shape),
             ("radiographs", radiographs, self._shape),
         ):
-            build.check_array(name, array, shape, context=self._context)
+            check_array(name, array, shape, context=self._context)
         if known is not None:
-            build.check_array("known", known, (views,), context=self._context)
+            check_array("known", known, (views,), context=self._context)
         event = cl.enqueue_marker(queue, [*(wait_for or ()), *self._last])
         event = self._reconstruct(queue, volume_out, radiographs, event)
         for part in self._parts():

@@ -17,7 +17,7 @@ from operator_cases import CASES, WITH_SCRATCH, Case, result, values
 
 from clra.ops.filtering import fft
 from clra.ops.filtering.fft import RealFFT
-from clra.ops.runtime import build
+from clra.ops.runtime.profile import CPU, GPU, forced
 
 OVERHEAD = 0.2e-3  # s, of a call over the bare launch
 
@@ -60,9 +60,8 @@ def test_in_a_foreign_context_and_queue_which_it_leaves_as_they_are(case, contex
     assert settles(lambda: queue.reference_count == references)
 
 
-@pytest.mark.parametrize("cpu", [True, False])
-def test_a_call_makes_flushes_and_finishes_no_queue(case, context, queue, monkeypatch, cpu):
-    monkeypatch.setattr(build, "is_cpu", lambda device: cpu)
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_a_call_makes_flushes_and_finishes_no_queue(case, context, queue, monkeypatch, form):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*transforms run on the host")  # see test_every_kernel
         operator = case.run(case.make(context))
@@ -199,10 +198,10 @@ def test_a_device_that_refuses_the_work_group(case, context, queue, expected, mo
         return min(found, 4) if what == cl.kernel_work_group_info.WORK_GROUP_SIZE else found
 
     monkeypatch.setattr(cl.Kernel, "get_work_group_info", grudging)
-    monkeypatch.setattr(build, "is_cpu", lambda device: False)
     # reikna's transforms see to their groups themselves, or leave it to the host.
     monkeypatch.setattr(fft, "_backend", lambda *_: "scipy")
-    found = result(case, case.make(context), queue)
+    with forced(GPU):
+        found = result(case, case.make(context), queue)
     atol = case.closeness * np.abs(expected).max()
     np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
 

@@ -13,9 +13,9 @@ from operator_cases import CASES, GRID, IMAGES, result
 from clra import kernels
 from clra.kernels.header import signatures
 from clra.ops.registration import phase_correlation
-from clra.ops.runtime import build
 from clra.ops.runtime.devices import choose_device
 from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.profile import CPU, GPU, forced
 from clra.ops.statistics.poisson import RayStatistics
 from clra.ops.streaming.multigrid import add_update, cropped
 from clra.ops.streaming.slab_projector import volume_from
@@ -30,9 +30,9 @@ def test_forms_for_cpu_and_gpu_agree(name, context, queue, monkeypatch):
     # Phase correlation depends on what images are padded to, which is for the transform to choose.
     monkeypatch.setattr(phase_correlation, "fast_length", lambda context, length: 32)
     case, found = CASES[name], []
-    for cpu in (True, False):
-        monkeypatch.setattr(build, "is_cpu", lambda device, cpu=cpu: cpu)
-        found.append(result(case, case.make(context), queue))
+    for profile in (CPU, GPU):
+        with forced(profile):
+            found.append(result(case, case.make(context), queue))
     assert np.isfinite(found[0]).all()
     atol = case.closeness * np.abs(found[0]).max()
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=atol)
@@ -61,10 +61,10 @@ def test_no_kernel_is_left_out(context, queue, monkeypatch):
 
     monkeypatch.setattr(Step, "__call__", noted)
     with warnings.catch_warnings(record=True) as warned:
-        for cpu in (True, False):
-            monkeypatch.setattr(build, "is_cpu", lambda device, cpu=cpu: cpu)
-            for case in CASES.values():
-                result(case, case.make(context), queue)
+        for profile in (CPU, GPU):
+            with forced(profile):
+                for case in CASES.values():
+                    result(case, case.make(context), queue)
         go_through_a_stream()
     files = [file for file in kernels.names() if file != "fft.cl" or not warned]
     assert launched >= {one.name for file in files for one in signatures(file)}

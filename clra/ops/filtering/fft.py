@@ -15,8 +15,8 @@ from pyopencl.array import Array
 from clra.errors import InputError
 from clra.ops.filtering.fft_device import DeviceFFT, NoPlanError
 from clra.ops.filtering.fft_host import HostFFT
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator
+from clra.ops.runtime.buffers import Allocator, check_array, check_queue
+from clra.ops.runtime.profile import profile_of
 
 BACKENDS = ("scipy", "reikna")
 
@@ -138,7 +138,7 @@ class RealFFT:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         n = self._count(image)
         self._check("image", image, (n, *self.shape[1:]))
         self._check("spectrum_out", spectrum_out, (n, *self.spectrum_shape[1:]), np.complex64)
@@ -155,7 +155,7 @@ class RealFFT:
 
         The spectrum has to be that of a real image; it is not changed.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         n = self._count(image_out)
         self._check("image_out", image_out, (n, *self.shape[1:]))
         self._check("spectrum", spectrum, (n, *self.spectrum_shape[1:]), np.complex64)
@@ -194,7 +194,7 @@ class RealFFT:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         n = self._count(image)
         self._check("image", image, (n, *self.shape[1:]))
         self._check("image_out", image_out, (n, *self.shape[1:]))
@@ -211,12 +211,12 @@ class RealFFT:
     def _check(
         self, name: str, array: Any, shape: tuple[int, ...], dtype: Any = np.float32
     ) -> None:
-        build.check_array(name, array, shape, dtype, self._context)
+        check_array(name, array, shape, dtype, self._context)
 
 
 def _backend(context: cl.Context, backend: str | None) -> str:
     if backend is None:
-        return "scipy" if build.is_cpu(build.device_of(context)) else "reikna"
+        return profile_of(context).fft
     if backend not in BACKENDS:
         raise InputError(f"backend: found {backend!r}, expected one of {', '.join(BACKENDS)}")
     return backend

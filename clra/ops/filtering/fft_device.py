@@ -8,9 +8,9 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from clra.ops.runtime import build
 from clra.ops.runtime.buffers import Allocator, Scratch
 from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.profile import device_of
 
 
 class NoPlanError(RuntimeError):
@@ -93,7 +93,7 @@ class DeviceFFT:
             return _Chain(compiled)
 
         self._plan = plan
-        first = build.device_of(context)
+        first = device_of(context)
         self._plans = {first: plan(first)}
         self._work = self._memory.empty(work, np.complex64)
         self.scratch_bytes = self._work.nbytes + 8 * math.prod(self._spectrum_shape)

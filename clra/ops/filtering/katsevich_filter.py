@@ -10,18 +10,21 @@ from pyopencl.array import Array
 
 from clra.model.helix.helix import Helix
 from clra.ops.filtering.fft import RealFFT, fast_length
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-from clra.ops.runtime.kernel import Step, to_device
-from clra.ops.runtime.lines import lanes
+from clra.ops.runtime.buffers import (
+    Allocator,
+    Scratch,
+    check_array,
+    check_images,
+    check_queue,
+    to_device,
+    within,
+)
+from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.profile import profile_of
 
 # Filter lines a row of the window. At the edges of a phantom the volume's error is 2.5 % larger
 # with as many lines as rows, and 0.3 % smaller with three times as many.
 _LINES_A_ROW = 1.5
-
-# Bytes of padded lines in work at a time, as for the ramp filter.
-_CPU_BYTES = 8 << 20
-_GPU_BYTES = 64 << 20
 
 # Some drivers take no more than 65535 work-groups along a range's second and third axes.
 _MOST_LINES = 1 << 15
@@ -97,11 +100,10 @@ class KatsevichFilter:
         self._rows_of_lines = to_device(context, np.stack([at_first, at_second - at_first], axis=1))
         self.padded = fast_length(context, 2 * columns, backend)
         self._hilbert = to_device(context, _spectrum(helix, self.padded), np.complex64)
-        cpu = build.is_cpu(build.device_of(context))
-        self._lanes = lanes(context)
+        self._lanes = profile_of(context).image_lanes
         self._stride = 8 * -(-columns // 8)
         self._lines_of_rows = to_device(context, _line_positions(helix, psi, window, self._stride))
-        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)
+        most = within(profile_of(context).filter_bytes, scratch_limit) // (4 * self.padded)
         self._batch = max(1, min(most // self._count, self.helix.views))
         lines = (self._batch * self._count, 1, self.padded)
         transformed = (min(lines[0], max(1, most), _MOST_LINES), 1, self.padded)
@@ -147,12 +149,10 @@ class KatsevichFilter:
         TypeError, InputError
             If an argument is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         measured = self._measured.shape
-        views = build.check_images("projections", projections, measured, self._context, 2) - 1
-        build.check_array(
-            "filtered_out", filtered_out, (views, *self.helix.shape), context=self._context
-        )
+        views = check_images("projections", projections, measured, self._context, 2) - 1
+        check_array("filtered_out", filtered_out, (views, *self.helix.shape), context=self._context)
         events = [*(wait_for or ()), *self._last]
         runs = -(-views // self._batch)
         for run in range(runs):

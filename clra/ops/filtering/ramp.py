@@ -12,22 +12,15 @@ from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.ops.filtering.fft import RealFFT, fast_length
 from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-from clra.ops.runtime.kernel import Step, to_device
-from clra.ops.runtime.lines import lanes
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
+from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.profile import profile_of
 
 WINDOWS = ("ram-lak", "shepp-logan", "hann")
 
 # Part of the rows at the top and at the bottom over which a view fades out. Without it the border
 # of each detector leaves an edge in the volume; a tenth smooths it and costs few rays.
 FADE = 0.1
-
-# Bytes of padded lines in work at a time. A CPU wants them in its cache between the steps (2 to 64
-# MiB differ by 10 % on two cores); a GPU wants enough of them to fill it, and its transform takes
-# three times as much again.
-_CPU_BYTES = 8 << 20
-_GPU_BYTES = 16 << 20
 
 # Some drivers take no more than 65535 work-groups along a range's second and third axes.
 _MOST_LINES = 1 << 15
@@ -141,9 +134,8 @@ class RampFilter:
         self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
         margin = math.ceil(_EXTENSION * self._columns) if extend else 0
         self.padded = fast_length(context, 2 * (self._columns + margin), backend)
-        cpu = build.is_cpu(build.device_of(context))
-        self._lanes = lanes(context)
-        most = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit) // (4 * self.padded)
+        self._lanes = profile_of(context).image_lanes
+        most = within(profile_of(context).filter_bytes, scratch_limit) // (4 * self.padded)
         lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
         memory = Scratch(context, allocator)
         self._lines = memory.empty(lines)
@@ -203,11 +195,11 @@ class RampFilter:
         TypeError, InputError
             If an argument is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         start, stop = successive(views, self._views)
         shape = (stop - start, self._rows, self._columns)
-        build.check_array("projections", projections, shape, context=self._context)
-        build.check_array("filtered_out", filtered_out, shape, context=self._context)
+        check_array("projections", projections, shape, context=self._context)
+        check_array("filtered_out", filtered_out, shape, context=self._context)
         total = shape[0] * self._rows
         events = [*(wait_for or ()), *self._last]
         sizes = (self._columns, self.padded)

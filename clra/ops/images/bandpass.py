@@ -11,10 +11,17 @@ from pyopencl.array import Array
 from clra.errors import InputError
 from clra.ops.images.bandpass_tables import plane_fit, reciprocal, spline_table
 from clra.ops.images.blur import gaussian_taps
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch
-from clra.ops.runtime.kernel import Step, to_device
-from clra.ops.runtime.lines import MARGIN, lanes, line_stride, lined
+from clra.ops.runtime.buffers import (
+    Allocator,
+    Scratch,
+    check_array,
+    check_images,
+    check_queue,
+    to_device,
+)
+from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.lines import MARGIN, line_stride, lined
+from clra.ops.runtime.profile import profile_of
 
 # Variance of the cubic B-spline, in squares of its knots' distance.
 _SPLINE = 1 / 3
@@ -118,7 +125,7 @@ class Bandpass:
         self._mask = to_device(context, lined(counts))
         self._scale = to_device(context, lined(reciprocal(counts, narrow)))
         self._fit = to_device(context, np.stack([lined(image) for image in plane_fit(means, wide)]))
-        self._lanes = lanes(context)
+        self._lanes = profile_of(context).image_lanes
         weights, bases = spline_table(columns, factor, self._lanes, _RIM)
         self._weights, self._bases = (
             to_device(context, lined(weights)),
@@ -184,11 +191,11 @@ class Bandpass:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
-        n = build.check_images("images", images, self.shape, self._context)
+        check_queue(queue, self._context)
+        n = check_images("images", images, self.shape, self._context)
         if n > self._views:
             raise InputError(f"images: found {n} of them, expected 1 to {self._views}")
-        build.check_array("out", out, (n, *self.shape), context=self._context)
+        check_array("out", out, (n, *self.shape), context=self._context)
         if self._own is None:
             self._own = self.empty(), self.empty_expanded()
         event = self.coefficients(queue, *self._own, images, wait_for)

@@ -8,8 +8,10 @@ import pyopencl as cl
 from numpy.typing import NDArray
 from pyopencl.array import Array
 
-from clra.ops.runtime.kernel import Step, to_device
-from clra.ops.runtime.lines import MARGIN, lanes, lined
+from clra.ops.runtime.buffers import to_device
+from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.lines import MARGIN, lined
+from clra.ops.runtime.profile import profile_of
 
 # Taps beyond this many sigmas weigh less than 0.3 % of the middle one.
 _REACH = 3.5
@@ -53,7 +55,7 @@ class Blur:
             to_device(context, taps),
             to_device(context, lined(1 / part[None])),
         )
-        self._lanes = lanes(context)
+        self._lanes = profile_of(context).image_lanes
         self._rows, self._columns = (
             Step(context, "blur.cl", name, (32, 1, 1), {"LANES": self._lanes})
             for name in ("blur_rows", "blur_columns")

@@ -6,9 +6,9 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.errors import InputError
-from clra.ops.runtime import build
+from clra.ops.runtime.buffers import check_array, check_queue
 from clra.ops.runtime.kernel import Step
-from clra.ops.runtime.lines import lanes
+from clra.ops.runtime.profile import profile_of
 
 
 class _Resampling:
@@ -19,7 +19,7 @@ class _Resampling:
     def __init__(self, context: cl.Context) -> None:
         self._context = context
         # On a CPU 8 columns an item are 3 times faster than one.
-        self._lanes = lanes(context)
+        self._lanes = profile_of(context).image_lanes
         self._step = Step(context, "pyramid.cl", self._kernel, (32, 4, 1), {"LANES": self._lanes})
 
     def _launch(
@@ -32,7 +32,7 @@ class _Resampling:
         wait_for: Sequence[cl.Event] | None,
     ) -> cl.Event:
         """Run over the rows and planes of `out` and blocks of `columns` coarse columns."""
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         size = (-(-columns // self._lanes), out.shape[1], out.shape[0])
         return self._step(queue, size, out, source, *sizes, wait_for=wait_for)
 
@@ -78,9 +78,9 @@ class Restrict2D(_Resampling):
             If an array is none of the above.
         """
         n, rows, columns = _shape("fine", fine, (1, 2, 2))
-        build.check_array("fine", fine, (n, rows, columns), context=self._context)
+        check_array("fine", fine, (n, rows, columns), context=self._context)
         half = (n, rows // 2, columns // 2)
-        build.check_array("coarse_out", coarse_out, half, context=self._context)
+        check_array("coarse_out", coarse_out, half, context=self._context)
         return self._launch(queue, coarse_out, fine, (*half, rows, columns), half[2], wait_for)
 
 
@@ -108,9 +108,9 @@ class Restrict3D(_Resampling):
         :class:`Restrict2D`.
         """
         planes, rows, columns = _shape("fine", fine, (2, 2, 2))
-        build.check_array("fine", fine, (planes, rows, columns), context=self._context)
+        check_array("fine", fine, (planes, rows, columns), context=self._context)
         half = (planes // 2, rows // 2, columns // 2)
-        build.check_array("coarse_out", coarse_out, half, context=self._context)
+        check_array("coarse_out", coarse_out, half, context=self._context)
         return self._launch(queue, coarse_out, fine, (*half, rows, columns), half[2], wait_for)
 
 
@@ -138,9 +138,9 @@ class Prolong3D(_Resampling):
         :class:`Restrict2D`.
         """
         fine = _shape("fine_out", fine_out, (2, 2, 2))
-        build.check_array("fine_out", fine_out, fine, context=self._context)
+        check_array("fine_out", fine_out, fine, context=self._context)
         half = (fine[0] // 2, fine[1] // 2, fine[2] // 2)
-        build.check_array("coarse", coarse, half, context=self._context)
+        check_array("coarse", coarse, half, context=self._context)
         # An odd last column has no coarse column of its own.
         columns = -(-fine[2] // 2)
         return self._launch(queue, fine_out, coarse, (*fine, *half), columns, wait_for)

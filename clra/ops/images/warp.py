@@ -8,17 +8,20 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.errors import InputError
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-from clra.ops.runtime.kernel import Step, to_device
-from clra.ops.runtime.lines import lanes, line_stride
+from clra.ops.runtime.buffers import (
+    Allocator,
+    Scratch,
+    check_array,
+    check_images,
+    check_queue,
+    to_device,
+    within,
+)
+from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.lines import line_stride
+from clra.ops.runtime.profile import profile_of
 
 _TAPS = 14  # as in warp.cl
-
-# Bytes of images in work at a time, in each of two buffers: a CPU wants them in its cache between
-# the steps (1 to 64 MiB differ by 20 % on two cores), a GPU wants enough of them to fill it.
-_CPU_BYTES = 8 << 20
-_GPU_BYTES = 32 << 20
 
 
 class Warp:
@@ -70,13 +73,12 @@ class Warp:
             raise InputError(f"shape: found {shape}, expected two positive numbers")
         self.shape = shape
         self._context = context
-        cpu = build.is_cpu(build.device_of(context))
-        self._lanes = lanes(context)
+        self._lanes = profile_of(context).image_lanes
         rows, columns = shape
         self._stride = line_stride(columns)
         # Of two images each; as many bytes are best for one.
         limit = None if scratch_limit is None else scratch_limit // 2
-        most = within(_CPU_BYTES if cpu else _GPU_BYTES, limit)
+        most = within(profile_of(context).warp_bytes, limit)
         self._most_views = max(1, most // (4 * rows * self._stride))
 
         def step(name: str) -> Step:
@@ -125,10 +127,10 @@ class Warp:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
-        n = build.check_images("measured", measured, self.shape, self._context)
-        build.check_array("corrected_out", corrected_out, (n, *self.shape), context=self._context)
-        build.check_array("motion", motion, (n, 3), context=self._context)
+        check_queue(queue, self._context)
+        n = check_images("measured", measured, self.shape, self._context)
+        check_array("corrected_out", corrected_out, (n, *self.shape), context=self._context)
+        check_array("motion", motion, (n, 3), context=self._context)
         chunk = min(n, self._most_views)
         events = [*(wait_for or ()), *self._last]
         for start in range(0, n, chunk):

@@ -13,9 +13,8 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, field_radii
 from clra.ops.filtering.ramp import FADE
 from clra.ops.projection.view_arguments import check_geometry, view_weights
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device
+from clra.ops.runtime.kernel import Step
 
 # Voxels in a coarse one, across the axis and along it, where a view fades out over a tenth of its
 # rows. At twice the size the error of W doubles, to 1 %; at half the size W costs as much as a
@@ -145,7 +144,7 @@ class Coverage:
         -------
         cl.Event
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         nx, ny, nz = self._coarse
         event = self._count(
             queue,
@@ -204,13 +203,13 @@ class Coverage:
         TypeError, InputError
             If the volume is not of this grid.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         planes, ny, nx = self._grid.shape
         slices = volume_order == "zyx"
         if getattr(volume, "ndim", 0) == 3:
             planes = min(planes - first, volume.shape[0 if slices else 2])
         shape = (planes, ny, nx) if slices else (ny, nx, planes)
-        build.check_array("volume", volume, shape, context=self._context)
+        check_array("volume", volume, shape, context=self._context)
         x, y, _ = self._grid.coordinates()
         size = self._grid.voxel_size
         event = self._normalise(

@@ -16,17 +16,12 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.projection.transpose import Planes, Transpose
 from clra.ops.projection.view_arguments import check_geometry, successive
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-from clra.ops.runtime.kernel import to_device
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
+from clra.ops.runtime.profile import profile_of
 
 _PAD = 24  # as in geometry.clh
 _PIECE = 32  # the most that kernels read from where they are, past the last line's end
 
-# Projections that one launch treats. They have to stay in the last cache of a CPU, and few launches
-# have to read and write the volume.
-_CPU_BYTES = 24 << 20
-_GPU_BYTES = 256 << 20
 _LEAST_VIEWS = 8
 
 
@@ -43,10 +38,6 @@ class Layout:
         Of the volume.
     volume_order : {"zyx", "yxz"}
         Order of the caller's volume.
-    lanes : {1, 8, 16}, optional
-        Form of the kernels, the one for the device by default; the others serve tests.
-    tilted : bool
-        Treat axial views as tilted ones; serves tests.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
     scratch_limit : int, optional
@@ -54,10 +45,12 @@ class Layout:
 
     Attributes
     ----------
-    lanes : int
-        As above.
+    profile : DeviceProfile
+        Of the context.
+    lanes : {1, 8, 16}
+        Its ``projector_lanes``.
     columnar : bool
-        Whether the kernels for columns apply, to a CPU and v parallel to z.
+        Whether the kernels for columns apply, to a CPU, v parallel to z and no steep ray.
     steep : bool
         Whether rays may advance fastest along z.
     table : Array
@@ -78,25 +71,23 @@ class Layout:
         geometry: ConeBeamGeometry,
         grid: VolumeGrid,
         volume_order: str,
-        lanes: int | None = None,
-        tilted: bool = False,
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
     ) -> None:
-        cpu = build.is_cpu(build.device_of(context))
+        self.profile = profile = profile_of(context)
         self.context = context
         self.grid = grid
-        self.lanes = lanes or _best_lanes(build.device_of(context))
+        self.lanes = profile.projector_lanes
         self.sizes = grid.shape[::-1]
-        self.detector = (geometry.columns, geometry.rows, 16 * -(-(geometry.rows + 2 * _PAD) // 16))
+        self.detector = (geometry.columns, geometry.rows, _pitch(geometry.rows))
+        self._view_elements = view_elements(geometry.shape)
         self.last: list[cl.Event] = []
         self._views = geometry.views
-        self._tilted = tilted
         self.volume_order = volume_order
         self._volume_shape = volume_shape(grid, volume_order)
-        self._bytes = within(_CPU_BYTES if cpu else _GPU_BYTES, scratch_limit)
+        self._bytes = within(profile.projector_bytes, scratch_limit)
         self._least = _LEAST_VIEWS if scratch_limit is None else 1
-        self._transpose = Transpose(context, min(self.lanes, 8))
+        self._transpose = Transpose(context)
         self._lines: Array | None = None
         self._volume: Array | None = None
         self._memory = Scratch(context, allocator)
@@ -110,8 +101,10 @@ class Layout:
         """Take other vectors of the same views and detector."""
         check_geometry(geometry, (self._views, self.detector[1], self.detector[0]))
         self.table = to_device(self.context, view_table(geometry, self.grid))
-        self.columnar = self.lanes > 1 and geometry.axial and not self._tilted
-        self.steep = not geometry.axial and _steep(geometry)
+        self.steep = _steep(geometry)
+        self.columnar = (
+            self.profile.columns and self.lanes > 1 and geometry.axial and not self.steep
+        )
 
     def check(
         self,
@@ -123,18 +116,12 @@ class Layout:
     ) -> tuple[int, int]:
         """Refuse what does not fit; first of the views, and one past the last."""
         start, stop = successive(views, self._views)
-        build.check_queue(queue, self.context)
+        check_queue(queue, self.context)
         columns, rows, _ = self.detector
-        build.check_array(names[0], volume, self._volume_shape, context=self.context)
+        check_array(names[0], volume, self._volume_shape, context=self.context)
         shape = (stop - start, rows, columns)
-        build.check_array(names[1], projections, shape, context=self.context)
+        check_array(names[1], projections, shape, context=self.context)
         return start, stop
-
-    @property
-    def _view_elements(self) -> int:
-        """Elements of a view's padded lines."""
-        columns, _, pitch = self.detector
-        return (columns + 1) * pitch
 
     @property
     def _most(self) -> int:
@@ -235,6 +222,16 @@ class Layout:
         return self._volume
 
 
+def _pitch(rows: int) -> int:
+    """Elements of a padded line."""
+    return 16 * -(-(rows + 2 * _PAD) // 16)
+
+
+def view_elements(shape: tuple[int, int]) -> int:
+    """Elements of the padded lines of a view of (rows, columns)."""
+    return (shape[1] + 1) * _pitch(shape[0])
+
+
 def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
     """Shape of a volume whose axes are in that order.
 
@@ -263,13 +260,6 @@ def _steep(geometry: ConeBeamGeometry) -> bool:
     nearest = np.sum(corners[:, :, :2] * level, axis=2).min(axis=0)
     highest = np.abs(corners[:, :, 2]).max(axis=0)
     return bool(np.any(1.0001 * highest > nearest / np.sqrt(2)))
-
-
-def _best_lanes(device: cl.Device) -> int:
-    """Lanes of the kernels, see geometry.clh."""
-    if not build.is_cpu(device):
-        return 1
-    return 16 if device.native_vector_width_float >= 16 else 8
 
 
 def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:

@@ -1,14 +1,12 @@
 """Line integrals of a volume and of the volume over its depth, in one pass."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import pyopencl as cl
 from pyopencl.array import Array
 
-from clra.model.geometry import ConeBeamGeometry
-from clra.model.grid import VolumeGrid
 from clra.ops.projection.projector import ForwardProjector
-from clra.ops.runtime.buffers import Allocator
 
 
 class MomentProjector(ForwardProjector):
@@ -25,25 +23,7 @@ class MomentProjector(ForwardProjector):
         As for :class:`ForwardProjector`.
     """
 
-    def __init__(
-        self,
-        context: cl.Context,
-        geometry: ConeBeamGeometry,
-        grid: VolumeGrid,
-        *,
-        volume_order: str = "zyx",
-        allocator: Allocator | None = None,
-        scratch_limit: int | None = None,
-    ) -> None:
-        super().__init__(
-            context,
-            geometry,
-            grid,
-            volume_order=volume_order,
-            allocator=allocator,
-            scratch_limit=scratch_limit,
-            _moment=True,
-        )
+    _DEFINES = MappingProxyType({"MOMENT": 1})
 
     def moments(
         self,

@@ -11,8 +11,8 @@ from clra.model.grid import VolumeGrid
 from clra.model.helix.helix import Helix
 from clra.model.helix.pi_intervals import pi_reach, pi_spans
 from clra.ops.projection.layout import Layout
-from clra.ops.runtime.buffers import Allocator
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import Allocator, to_device
+from clra.ops.runtime.kernel import Step
 
 # Voxels along z that a work-item of a CPU sums. A view sees a short part of the volume: of longer
 # blocks much is idle.
@@ -70,7 +70,6 @@ class PiBackProjector:
         *,
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
-        _lanes: int | None = None,
     ) -> None:
         own = helices[helix]
         self._helix, self._helices, self._radius = helix, helices, radius
@@ -79,7 +78,6 @@ class PiBackProjector:
             own.geometry(),
             grid,
             "yxz",
-            _lanes,
             allocator=allocator,
             scratch_limit=scratch_limit,
         )

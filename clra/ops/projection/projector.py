@@ -4,7 +4,8 @@ Projections are (view, row, column) and volumes (z, y, x), or (y, x, z) for ``vo
 the order that the kernels work in.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import pyopencl as cl
 from pyopencl.array import Array
@@ -69,6 +70,8 @@ class ForwardProjector:
        Trans. Med. Imaging 1, 192 (1982).
     """
 
+    _DEFINES: Mapping[str, object] = MappingProxyType({})  # of the kernels
+
     def __init__(
         self,
         context: cl.Context,
@@ -78,18 +81,12 @@ class ForwardProjector:
         volume_order: str = "zyx",
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
-        _lanes: int | None = None,
-        _tilted: bool = False,
-        _moment: bool = False,
     ) -> None:
-        self._layout = Layout(
-            context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
-        )
+        self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
         self.scratch_bytes = self._layout.scratch_bytes
         kernels = ("forward_rays", "forward_columns", "forward_tilted")
-        moment = {"MOMENT": 1} if _moment else None
         self._project = Blocks(
-            self._layout, "forwardproject", kernels, geometry.rows, _LINE, moment
+            self._layout, "forwardproject", kernels, geometry.rows, _LINE, self._DEFINES
         )
         nz, ny, nx = grid.shape
         planes = max(nz, ny, nx)
@@ -234,12 +231,8 @@ class BackProjector:
         volume_order: str = "zyx",
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
-        _lanes: int | None = None,
-        _tilted: bool = False,
     ) -> None:
-        self._layout = Layout(
-            context, geometry, grid, volume_order, _lanes, _tilted, allocator, scratch_limit
-        )
+        self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
         self.scratch_bytes = self._layout.scratch_bytes
         nz = grid.shape[0]
         if matched:

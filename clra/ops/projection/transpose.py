@@ -6,8 +6,8 @@ from typing import NamedTuple
 import pyopencl as cl
 from pyopencl.array import Array
 
-from clra.ops.runtime import build
 from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.profile import profile_of
 
 _TILE = {1: 32, 8: 8}  # by lanes, as in transpose.cl
 
@@ -29,12 +29,10 @@ class Transpose:
     ----------
     context : cl.Context
         Where the arrays live.
-    lanes : {1, 8}, optional
-        Form of the kernel, the one for the device by default.
     """
 
-    def __init__(self, context: cl.Context, lanes: int | None = None) -> None:
-        lanes = lanes or (8 if build.is_cpu(build.device_of(context)) else 1)
+    def __init__(self, context: cl.Context) -> None:
+        lanes = 8 if profile_of(context).on_cpu else 1
         self._tile = _TILE[lanes]
         # Where a device allows less, there are more groups than tiles; those beyond do nothing.
         self._local = 256 if lanes == 1 else 1

@@ -13,10 +13,10 @@ from clra.ops.images.bandpass import Bandpass
 from clra.ops.images.blur import Blur
 from clra.ops.registration.phase_correlation import CoarseShift, check_pair
 from clra.ops.registration.windows import registration_window
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch, within
-from clra.ops.runtime.kernel import Step, group, to_device
-from clra.ops.runtime.lines import lanes, line_stride, lined
+from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
+from clra.ops.runtime.kernel import Step, group
+from clra.ops.runtime.lines import line_stride, lined
+from clra.ops.runtime.profile import profile_of
 
 ESTIMATE_FIELDS = (
     "shift_u",
@@ -50,8 +50,6 @@ _TOLERANCE = 1e-3
 # Longest step, pixels: structures are hardly narrower, so that longer ones may not be trusted.
 _MAX_STEP = 2.0
 _MAX_MAGNIFICATION = 0.05
-# Scratch memory. On two cores, half of it is 3 % slower and twice as much 2 % faster.
-_SCRATCH_CPU, _SCRATCH_GPU = 128 << 20, 512 << 20
 
 
 def pair_bytes(shape: tuple[int, int], high_pass: float) -> int:
@@ -160,10 +158,9 @@ class Registration:
             raise InputError(f"iterations: found {iterations}, expected 1 or more")
         if not max_shift > 0:
             raise InputError(f"max_shift: found {max_shift}, expected a positive number of pixels")
-        cpu = build.is_cpu(build.device_of(context))
         if views is not None and views < 1:
             raise InputError(f"views: found {views}, expected 1 or more")
-        most = within(_SCRATCH_CPU if cpu else _SCRATCH_GPU, scratch_limit)
+        most = within(profile_of(context).registration_bytes, scratch_limit)
         fitting = max(1, most // pair_bytes(shape, high_pass))
         views = fitting if views is None else min(views, fitting)
         self._context, self._views = context, views
@@ -209,7 +206,7 @@ class Registration:
         self._group = group(context, *sums, 64)
         defines = {"GROUP": self._group}
         if self._group == 1:
-            defines["LANES"] = lanes(context)
+            defines["LANES"] = profile_of(context).image_lanes
         self._normal_equations = Step(context, *sums, (self._group, 1, 1), defines)
         self._start = Step(context, "gauss_newton.cl", "start", (1,))
         self._advance = Step(context, "gauss_newton.cl", "advance", (1,))
@@ -254,13 +251,13 @@ class Registration:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         n = check_pair(self._context, self.shape, measured, simulated)
-        build.check_array(
+        check_array(
             "estimates_out", estimates_out, (n, len(ESTIMATE_FIELDS)), context=self._context
         )
         if known is not None:
-            build.check_array("known", known, (n,), context=self._context)
+            check_array("known", known, (n,), context=self._context)
         for start in range(0, n, self._views):
             part = slice(start, min(n, start + self._views))
             event = self._prepare(

@@ -10,10 +10,17 @@ from pyopencl.array import Array
 
 from clra.ops.filtering.fft import RealFFT, fast_length
 from clra.ops.registration.windows import tukey
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch
-from clra.ops.runtime.kernel import Step, group, to_device
-from clra.ops.runtime.lines import lanes, lined
+from clra.ops.runtime.buffers import (
+    Allocator,
+    Scratch,
+    check_array,
+    check_images,
+    check_queue,
+    to_device,
+)
+from clra.ops.runtime.kernel import Step, group
+from clra.ops.runtime.lines import lined
+from clra.ops.runtime.profile import profile_of
 
 # Part of the mean modulus of a pair's cross-power below which a frequency fades out of the phase
 # correlation. Where motion has blurred a reconstruction, what a re-projection still has of high
@@ -162,7 +169,7 @@ class CoarseShift:
         )
         half = weights[: rows // 2 * 2 : 2, : columns // 2 * 2 : 2]
         self._window = to_device(context, lined(half))
-        self._lanes = lanes(context)
+        self._lanes = profile_of(context).image_lanes
         self._halve = Step(
             context, "phase_correlation.cl", "halve", (32, 1, 1), {"LANES": self._lanes}
         )
@@ -290,9 +297,9 @@ class PhaseCorrelation:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         n = check_pair(self._context, self._shape, measured, simulated)
-        build.check_array("shifts_out", shifts_out, (n, 2), context=self._context)
+        check_array("shifts_out", shifts_out, (n, 2), context=self._context)
         for start in range(0, n, self._views):
             part = slice(start, min(n, start + self._views))
             waits = [*(wait_for or ()), *self._last]
@@ -331,6 +338,6 @@ def check_pair(
     context: cl.Context, shape: tuple[int, int], measured: Array, simulated: Array
 ) -> int:
     """Return the number of pairs, after both arrays were found to be (n, rows, columns)."""
-    n = build.check_images("measured", measured, shape, context)
-    build.check_array("simulated", simulated, (n, *shape), context=context)
+    n = check_images("measured", measured, shape, context)
+    check_array("simulated", simulated, (n, *shape), context=context)
     return n

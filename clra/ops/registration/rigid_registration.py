@@ -12,9 +12,16 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.rigid_motion import turning_axes, view_axes
 from clra.ops.images.bandpass import Bandpass
 from clra.ops.registration.windows import registration_window
-from clra.ops.runtime import build
-from clra.ops.runtime.buffers import Allocator, Scratch
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import (
+    Allocator,
+    Scratch,
+    check_array,
+    check_images,
+    check_queue,
+    to_device,
+)
+from clra.ops.runtime.kernel import Step
+from clra.ops.runtime.profile import profile_of
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +85,7 @@ class RigidRegistration:
             raise InputError(f"views: found {views}, expected 1 or more")
         self.shape, self._context, self._views = shape, context, views
         self.low_pass = low_pass
-        cpu = build.is_cpu(build.device_of(context))
+        cpu = profile_of(context).on_cpu
         self._strands = 1 if cpu else 64
         memory = Scratch(context, allocator)
         self._band = Bandpass(
@@ -145,14 +152,14 @@ class RigidRegistration:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
-        n = build.check_images("measured", measured, self.shape, self._context)
+        check_queue(queue, self._context)
+        n = check_images("measured", measured, self.shape, self._context)
         if n > self._views:
             raise InputError(f"measured: found {n} views, expected 1 to {self._views}")
         for name, array in (("simulated", simulated), ("over_depth", over_depth)):
-            build.check_array(name, array, (n, *self.shape), context=self._context)
-        build.check_array("views", views, (n, TABLE), context=self._context)
-        build.check_array("totals_out", totals_out, (n, PRODUCTS), context=self._context)
+            check_array(name, array, (n, *self.shape), context=self._context)
+        check_array("views", views, (n, TABLE), context=self._context)
+        check_array("totals_out", totals_out, (n, PRODUCTS), context=self._context)
         rows, columns = self.shape
         event = self._derivatives(
             queue,

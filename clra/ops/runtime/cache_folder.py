@@ -1,7 +1,7 @@
 """Where verdicts and compiled kernels are kept between runs, and what if nothing can be kept there.
 
-PoCL ends without a device where it cannot make its cache folder. So folders are looked at before
-OpenCL is, and a temporary one stands in for those that are of no use.
+PoCL ends without a device where it cannot make its cache folder, and pyopencl fails with the first
+kernel. So folders are looked at before OpenCL is, and a temporary one stands in for them.
 """
 
 import os
@@ -20,16 +20,15 @@ ROOM = 32 << 20  # bytes; PoCL's binaries of all kernels take about 10 MiB
 
 @cache
 def cache_folder() -> Path:
-    """Folder for what clra keeps between runs.
+    """Folder for what clra keeps between runs, by the platform's convention.
 
-    By the platform's convention (``$XDG_CACHE_HOME/clra``, ``~/.cache/clra``), or a temporary one
-    with a warning where nothing can be written there. PoCL is told a temporary one as well where
-    its own is of no use.
+    Where it, or those of PoCL and pyopencl, cannot be written to, the process and its children get
+    a temporary one by ``XDG_CACHE_HOME``.
 
     Returns
     -------
     Path
-        It exists.
+        ``$XDG_CACHE_HOME/clra`` or ``~/.cache/clra`` on Linux; it exists.
 
     Raises
     ------
@@ -41,21 +40,22 @@ def cache_folder() -> Path:
     ClraWarning
         If a temporary folder is used instead.
     """
-    own, pocls = _own_folder(), _pocl_folder()
-    problems = {folder: unusable(folder) for folder in (own, pocls)}
-    if problems[own] or problems[pocls]:
-        folder, problem = next((f, p) for f, p in problems.items() if p)
-        temporary = _temporary_folder(f"{folder}: {problem}")
-        warnings.warn(
-            f"{folder}: {problem}: verdicts and compiled kernels are kept in {temporary}; set "
-            "XDG_CACHE_HOME to a folder with room to keep them there",
-            ClraWarning,
-            stacklevel=2,
-        )
-        if problems[own]:
-            own = temporary
-        if problems[pocls]:
-            os.environ["POCL_CACHE_DIR"] = str(temporary / "pocl")
+    pocl = Path(os.environ.get("POCL_CACHE_DIR") or _xdg_cache() / "pocl")
+    for folder in (_own_folder(), pocl, _xdg_cache() / "pytools"):
+        if problem := unusable(folder):
+            temporary = _temporary_folder(f"{folder}: {problem}")
+            os.environ["XDG_CACHE_HOME"] = str(temporary)
+            os.environ.pop("POCL_CACHE_DIR", None)
+            warnings.warn(
+                f"{folder}: {problem}: verdicts and compiled kernels are kept in {temporary}; set "
+                "XDG_CACHE_HOME to a folder with room to keep them there",
+                ClraWarning,
+                stacklevel=2,
+            )
+            own = temporary / "clra"
+            break
+    else:
+        own = _own_folder()
     own.mkdir(parents=True, exist_ok=True)
     return own
 
@@ -82,12 +82,6 @@ def _own_folder() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or _home()) / "clra" / "Cache"
     return _xdg_cache() / "clra"
-
-
-def _pocl_folder() -> Path:
-    """As PoCL chooses it (pocl_cache.c)."""
-    given = os.environ.get("POCL_CACHE_DIR")
-    return Path(given) if given else _xdg_cache() / "pocl"
 
 
 def _xdg_cache() -> Path:

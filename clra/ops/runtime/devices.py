@@ -52,7 +52,7 @@ class DeviceInfo:
 def _all_devices() -> list[tuple[str, cl.Device]]:
     try:
         intel_driver.register(cache_folder())
-    except DeviceError:  # no folder can be written to; GPUs do without
+    except (DeviceError, OSError):  # no folder can be written to; GPUs do without
         pass
     try:
         platforms = cl.get_platforms()

@@ -7,7 +7,8 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from clra.ops.runtime import build
+from clra.ops.runtime.build import builds
+from clra.ops.runtime.profile import profile_of
 
 
 class Step:
@@ -33,7 +34,7 @@ class Step:
         local: Sequence[int],
         defines: Mapping[str, object] | None = None,
     ) -> None:
-        self._builds = build.builds(context)  # held, so that others find it
+        self._builds = builds(context)  # held, so that others find it
         self._kernel = self._builds.kernel(file, function, defines)
         self._wanted = tuple(local)
         self._allowed: dict[cl.Device, tuple[int, ...]] = {}
@@ -52,7 +53,7 @@ class Step:
         values: list[Any] = []
         for argument in arguments:
             if isinstance(argument, Array):
-                values.extend(build.buffer_argument(argument))
+                values.extend(buffer_argument(argument))
             elif isinstance(argument, float):
                 values.append(np.float32(argument))
             else:
@@ -60,26 +61,39 @@ class Step:
         device = queue.device
         local = self._allowed.get(device)
         if local is None:
-            local = build.work_group_size(self._kernel, device, self._wanted)
+            local = work_group_size(self._kernel, device, self._wanted)
             self._allowed[device] = local
-        return self._kernel(
-            queue, build.global_size(size, local), local, *values, wait_for=wait_for
-        )
+        return self._kernel(queue, global_size(size, local), local, *values, wait_for=wait_for)
 
 
-def to_device(context: cl.Context, values: Any, dtype: Any = np.float32) -> Array:
-    """Copy of host values in an array of the context; takes no queue."""
-    host = np.ascontiguousarray(values, dtype)
-    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
-    return Array(context, host.shape, host.dtype, data=cl.Buffer(context, flags, hostbuf=host))
+def buffer_argument(array: Array) -> tuple[Any, np.uint64]:
+    """Buffer and offset in elements: the two arguments by which every kernel takes an array."""
+    return array.base_data, np.uint64(array.offset // array.dtype.itemsize)
+
+
+def global_size(shape: Sequence[int], local: Sequence[int]) -> tuple[int, ...]:
+    """`shape` rounded up to whole work-groups."""
+    return tuple(-(-n // m) * m for n, m in zip(shape, local, strict=True))
+
+
+def work_group_size(
+    function: cl.Kernel, device: cl.Device, wanted: Sequence[int]
+) -> tuple[int, ...]:
+    """`wanted`, halved from the last dimension on until the built kernel allows it."""
+    limit = function.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device)
+    sizes = [min(n, m) for n, m in zip(wanted, device.max_work_item_sizes, strict=False)]
+    while np.prod(sizes) > limit:
+        largest = max(range(len(sizes)), key=lambda axis: (sizes[axis], axis))
+        sizes[largest] = max(1, sizes[largest] // 2)
+    return tuple(sizes)
 
 
 def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
     """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
-    size = 1 if build.is_cpu(build.device_of(context)) else wanted
+    size = min(wanted, profile_of(context).reduction_group)
     while size > 1:
-        kernel = build.builds(context).kernel(file, function, {"GROUP": size})
-        if all(build.work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
+        kernel = builds(context).kernel(file, function, {"GROUP": size})
+        if all(work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
             break
         size //= 2
     return size

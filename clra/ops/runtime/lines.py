@@ -1,18 +1,10 @@
-"""Vectors of columns, and lined images, whose lines may be read past their ends: see lanes.clh."""
+"""Lined images, whose lines may be read past their ends: see vectors.clh."""
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
-from clra.ops.runtime import build
-
-# As in lanes.clh.
+# As in vectors.clh.
 MARGIN = 16
-
-
-def lanes(context: cl.Context) -> int:
-    """Columns that a work-item handles at a time."""
-    return 8 if build.is_cpu(build.device_of(context)) else 2
 
 
 def line_stride(columns: int) -> int:

@@ -9,7 +9,8 @@ wrongly, or, where LLVM only knows a "generic" CPU (Zen 5), nothing builds at al
 and 1049). PoCL 5.0 pairs each variant with a CPU name (pull request 1268). :func:`pair` does the
 same for older ones: PoCL's device record holds a pointer to the target triple, followed by one to
 the CPU's name (``llvm_target_triplet`` and ``llvm_cpu`` in pocl_cl.h of 1.0 to 4.0), and no option
-or environment variable sets them.
+or environment variable sets them. The device's version ends with both ("HSTR: pthread-...-znver3").
+Debian's 3.1 has the cure and another record; its version ends with the right name.
 """
 
 import ctypes
@@ -58,6 +59,7 @@ def needs_pairing(device: cl.Device) -> bool:
     release = re.search(r"PoCL (\d+)\.", platform.version)
     return (
         "Portable Computing Language" in platform.name
+        and bool(device.type & cl.device_type.CPU)
         and release is not None
         and int(release[1]) < 5
         and "DISTRO" in platform.version
@@ -110,7 +112,8 @@ def pair(device: cl.Device) -> str | None:
     records = [device]
     while records[-1].parent_device is not None:
         records.append(records[-1].parent_device)
-    return name if all([pair_record(record.int_ptr, name) for record in records]) else None
+    done = [pair_record(record.int_ptr, record.version, name) for record in records]
+    return name if all(done) or device.version.strip().endswith(f"-{name}") else None
 
 
 def prefer_cpu(name: str | None) -> None:
@@ -140,30 +143,35 @@ def cpu_flags() -> frozenset[str]:
     return frozenset(line[1].split()) if line else frozenset()
 
 
-def pair_record(record: int, name: str) -> bool:
+def pair_record(record: int, version: str, name: str) -> bool:
     """Let a device record's CPU name be `name`.
 
     Parameters
     ----------
     record : int
         Address of PoCL's device record.
+    version : str
+        The device's version, which ends with the triple and the CPU name.
     name : str
         CPU name that LLVM knows.
 
     Returns
     -------
     bool
-        Whether the record has that name now; False, and nothing is written, if it does not hold a
-        triple of x86-64 Linux followed by a CPU name, or is not writable.
+        Whether the record has that name now; False, and nothing is written, if it does not hold the
+        triple and the CPU name of the version beside each other, or is not writable.
     """
     memory = _Memory.of_process()
     words = memory.readable_bytes(record, _RECORD_BYTES) // _WORD
     pointers = (ctypes.c_void_p * words).from_address(record) if words else ()
     for at in range(words - 1):
         triple, found = memory.text(pointers[at]), memory.text(pointers[at + 1])
-        if _TRIPLE.fullmatch(triple) and _CPU.fullmatch(found):
-            if found == name.encode():
-                return True
+        if not (_TRIPLE.fullmatch(triple) and _CPU.fullmatch(found)):
+            continue
+        if found == name.encode():
+            return True
+        known = version.strip().endswith(f"-{triple.decode()}-{found.decode()}")
+        if known or found.decode() in _names:
             if not memory.writable(record + (at + 1) * _WORD, _WORD):
                 return False
             text = _names.setdefault(name, ctypes.create_string_buffer(name.encode()))

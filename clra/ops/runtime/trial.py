@@ -24,6 +24,7 @@ from clra.model.trajectory import circular
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
 from clra.ops.runtime import build, devices, pocl, self_test
+from clra.ops.runtime.kernel import work_group_size
 
 # Of the largest value: float32 rounding stays below 1e-6; a registration is exact to 1.6e-3.
 TOLERANCE, REGISTRATION_TOLERANCE = 1e-4, 3e-3
@@ -35,7 +36,7 @@ kernel void vectors(global float *out, global const int *in)
     const int i = get_global_id(0);
     const float16 x = convert_float16(vload16(i, in));
     const float8 y = convert_float8(convert_long8(vload8(2 * i, in)));
-    const float8 z = convert_float8(convert_ushort8_sat(vload8(2 * i + 1, in)));
+    const float8 z = convert_float8(convert_uchar8_sat(vload8(2 * i + 1, in)));
     vstore16(fma(x, (float16)(0.5f), floor(x * 0.3f)), 2 * i, out);
     vstore16((float16)(convert_float8(convert_int8_rtz(y * 0.7f)), z), 2 * i + 1, out);
 }
@@ -63,7 +64,7 @@ Case = Callable[[cl.CommandQueue], tuple[Floats, Floats]]
 
 def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     """Conversions and arithmetic in vectors of 8 and 16, and numpy's."""
-    numbers = np.random.default_rng(0).integers(-90_000, 90_000, (64, 16), np.int32)
+    numbers = np.random.default_rng(0).integers(-500, 500, (64, 16), np.int32)
     program = _program(queue)
     out = cl_array.empty(queue, (64, 32), np.float32)
     given = cl_array.to_device(queue, numbers)
@@ -72,14 +73,14 @@ def vectors(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     single = numbers.astype(np.float32)
     sums = single.astype(np.float64) * 0.5 + np.floor(single * np.float32(0.3))
     truncated = np.trunc(single[:, :8] * np.float32(0.7))
-    clipped = np.clip(numbers[:, 8:], 0, 65535)
+    clipped = np.clip(numbers[:, 8:], 0, 255)
     return out.get().astype(np.float64), np.hstack([sums, truncated, clipped])
 
 
 def running_sums(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     """Cumulative sums over work-groups, through local memory."""
     kernel: Any = cl.Kernel(_program(queue), "running_sums")
-    (size,) = build.work_group_size(kernel, queue.device, (32,))
+    (size,) = work_group_size(kernel, queue.device, (32,))
     numbers = np.arange(3 * size, dtype=np.int32) % 7
     out = cl_array.empty(queue, numbers.shape, np.float32)
     given = cl_array.to_device(queue, numbers)
@@ -158,13 +159,15 @@ def registration(queue: cl.CommandQueue) -> tuple[Floats, Floats]:
     return estimates.get()[0, :2].astype(np.float64), np.array(_SHIFT)
 
 
+# Those first that end soonest where PoCL's compiler is given the wrong CPU: it aborts in the
+# projectors, while the vectors take it minutes.
 CASES: dict[str, tuple[Case, float]] = {
-    "vectors": (vectors, TOLERANCE),
-    "local memory": (running_sums, TOLERANCE),
-    "forward projection": (forward_projection, TOLERANCE),
     "back-projection": (back_projection, TOLERANCE),
+    "forward projection": (forward_projection, TOLERANCE),
     "adjoint": (adjoint, TOLERANCE),
     "registration": (registration, REGISTRATION_TOLERANCE),
+    "local memory": (running_sums, TOLERANCE),
+    "vectors": (vectors, TOLERANCE),
 }
 
 
@@ -216,7 +219,8 @@ def main(request: str) -> None:
         raise LookupError(f"device {asked['index']} is another one here")
     pocl.prefer_cpu(asked["cpu"])
     pocl.build_options([device])
-    queue = cl.CommandQueue(cl.Context([device]))
+    context = cl.Context([device])  # kept: Intel's queues do not keep theirs
+    queue = cl.CommandQueue(context)
     found = failure(queue)
     speed = rate(queue) if asked["rate"] and not found else None
     print(json.dumps({"failure": found, "rate": speed}), flush=True)

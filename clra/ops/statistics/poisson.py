@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
 from clra.errors import InputError
-from clra.ops.runtime import build
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import check_array, check_images, check_queue, to_device
+from clra.ops.runtime.kernel import Step
 
 _FILE = "poisson.cl"
 
@@ -202,11 +202,11 @@ class RayStatistics:
 
     def _check(self, queue: cl.CommandQueue, **arrays: Array) -> int:
         """Refuse what does not fit; number of views."""
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         measured = arrays.pop("measured")
-        n = build.check_images("measured", measured, self._shape, self._context)
+        n = check_images("measured", measured, self._shape, self._context)
         for name, array in arrays.items():
-            build.check_array(name, array, (n, *self._shape), context=self._context)
+            check_array(name, array, (n, *self._shape), context=self._context)
         return n
 
 
@@ -291,9 +291,9 @@ class VolumeStep:
         self, queue: cl.CommandQueue, volume: Array, numerator: Array, denominator: Array
     ) -> tuple[int, int]:
         """Refuse what does not fit; voxels along the last axis, and lines of them."""
-        build.check_queue(queue, self._context)
+        check_queue(queue, self._context)
         shape: tuple[int, ...] = getattr(volume, "shape", ())
         named = {"volume": volume, "numerator": numerator, "denominator": denominator}
         for name, array in named.items():
-            build.check_array(name, array, shape, context=self._context)
+            check_array(name, array, shape, context=self._context)
         return int(shape[-1]), int(np.prod(shape[:-1]))

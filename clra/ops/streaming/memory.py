@@ -9,7 +9,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clra.errors import DeviceError, InputError
-from clra.ops.runtime import build
+from clra.ops.runtime.profile import DeviceProfile, profile_of
 
 Floats = NDArray[np.float32]
 
@@ -60,8 +60,8 @@ class Budgets:
         Arrays that stay on the host.
     piece : int
         Parts in which arrays are copied.
-    shared : bool
-        Whether the device works in the host's memory.
+    profile : DeviceProfile
+        Of the device.
     """
 
     device: int
@@ -70,7 +70,12 @@ class Budgets:
     scratch: int
     kept: int
     piece: int
-    shared: bool
+    profile: DeviceProfile
+
+    @property
+    def shared(self) -> bool:
+        """Whether the device works in the host's memory."""
+        return self.profile.shared_memory
 
     @classmethod
     def of(cls, device: cl.Device, most_device: int | None, most_host: int | None) -> "Budgets":
@@ -80,7 +85,8 @@ class Budgets:
                 raise InputError(f"{name}: found {value}, expected a positive number of bytes")
         host = most_host or host_memory() // 2
         budget = most_device or device.global_mem_size * 3 // 4
-        shared = build.is_cpu(device)
+        profile = profile_of(device)
+        shared = profile.shared_memory
         if shared:
             budget = min(budget, host // 2)
         return cls(
@@ -90,7 +96,7 @@ class Budgets:
             scratch=budget // 12,
             kept=host // 4,
             piece=min(_PIECE_BYTES, budget // 16, host // 64),
-            shared=shared,
+            profile=profile,
         )
 
     def chunk(self, view_bytes: int) -> int:

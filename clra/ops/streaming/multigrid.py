@@ -8,8 +8,8 @@ from pyopencl.array import Array
 
 from clra.model.grid import VolumeGrid
 from clra.ops.images.pyramid import Prolong3D, Restrict3D
-from clra.ops.runtime import build
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import check_array, check_images, check_queue, to_device
+from clra.ops.runtime.kernel import Step
 from clra.ops.streaming.slab_projector import writable
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
@@ -220,11 +220,11 @@ class Residual:
         TypeError, InputError
             If an array is none of the above.
         """
-        build.check_queue(queue, self._context)
-        n = build.check_images("measured", measured, self._used.shape, self._context)
+        check_queue(queue, self._context)
+        n = check_images("measured", measured, self._used.shape, self._context)
         for name, array in (("residual_out", residual_out), ("simulated", simulated)):
-            build.check_array(name, array, (n, *self._used.shape), context=self._context)
-        build.check_array("motion", motion, (n, 3), context=self._context)
+            check_array(name, array, (n, *self._used.shape), context=self._context)
+        check_array("motion", motion, (n, 3), context=self._context)
         rows, columns = self._used.shape
         return self._step(
             queue,

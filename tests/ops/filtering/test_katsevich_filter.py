@@ -126,9 +126,9 @@ def test_chunks_and_offsets_change_nothing(context, kind, request, monkeypatch):
     expected = cl_array.empty(queue, shape, np.float32)
     whole(queue, expected, cl_array.to_device(queue, image)).wait()
     # room for two views' lines, and for the transforms of a part of them
-    monkeypatch.setattr(katsevich_filter, "_CPU_BYTES", 2 * 4 * whole.padded * whole._count + 100)
     monkeypatch.setattr(katsevich_filter, "_MOST_LINES", 31)
-    small = KatsevichFilter(context, BASE, RADIUS)
+    room = 2 * 4 * whole.padded * whole._count + 100
+    small = KatsevichFilter(context, BASE, RADIUS, scratch_limit=room)
     assert small.scratch_bytes < whole.scratch_bytes
     out = cl_array.zeros(queue, (shape[0] + 1, *shape[1:]), np.float32)[1:]
     measured = cl_array.to_device(queue, np.concatenate([image[:1], image]))[1:]

@@ -159,13 +159,13 @@ def test_a_centred_sphere_has_its_attenuation(context, queue):
     np.testing.assert_allclose(found, attenuation, rtol=INTENSITY)
 
 
-def test_any_chunk_gives_the_same(context, queue, monkeypatch):
+def test_any_chunk_gives_the_same(context, queue):
     geometry = scanner(views=5)
     image = image_of(geometry)
     expected = run(context, queue, geometry, image)
-    monkeypatch.setattr(ramp_module, "_CPU_BYTES", 4 * 27 * 3)  # 3 lines at a time
-    monkeypatch.setattr(ramp_module, "_GPU_BYTES", 4 * 32 * 3)
     ramp_filter = RampFilter(context, geometry)
+    three_lines = 4 * ramp_filter.padded * 3
+    ramp_filter = RampFilter(context, geometry, scratch_limit=three_lines)
     whole = cl_array.to_device(queue, image)
     for start, stop in [(1, 2), (0, 1), (2, 5)]:
         part = slice(start, stop)

@@ -6,8 +6,8 @@ import pyopencl.array as cl_array
 import pytest
 from scipy import ndimage
 
-from clra.ops.images import bandpass
 from clra.ops.images.bandpass import Bandpass
+from clra.ops.runtime.profile import CPU, GPU
 
 ROUNDING = 3e-6  # of images of values around 1
 GAUSSIAN = 0.01  # of the filtered image's largest value: splines and cut-off taps for Gaussians
@@ -80,13 +80,12 @@ def spline(at: np.ndarray, n: int) -> np.ndarray:
     return matrix
 
 
-@pytest.mark.parametrize("lanes", [8, 2])
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
 @pytest.mark.parametrize(
     ("shape", "low", "high", "factor"),
     [((37, 45), 1.0, 9.0, 4), ((33, 64), 0.7, 3.9, 1), ((40, 35), 1.5, 8.0, 2)],
 )
-def test_is_the_formula(context, queue, monkeypatch, lanes, shape, low, high, factor):
-    monkeypatch.setattr(bandpass, "lanes", lambda context: lanes)
+def test_is_the_formula(context, queue, form, shape, low, high, factor):
     image = images(shape)
     found = run(context, queue, image, low_pass=low, high_pass=high)
     for one, expected in zip(found, image, strict=True):

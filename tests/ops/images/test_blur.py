@@ -4,16 +4,16 @@ from scipy import ndimage
 
 from clra.ops.images.blur import Blur, gaussian_taps
 from clra.ops.runtime import lines
-from clra.ops.runtime.kernel import to_device
+from clra.ops.runtime.buffers import to_device
 from clra.ops.runtime.lines import MARGIN, line_stride, lined
+from clra.ops.runtime.profile import CPU, GPU
 
 ROUNDING = 2e-6  # of values around 1
 
 
-@pytest.mark.parametrize("lanes", [8, 2])
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
 @pytest.mark.parametrize(("shape", "sigma"), [((23, 37), 2.0), ((40, 16), 3.5), ((5, 70), 0.7)])
-def test_is_the_mean_of_what_lies_on_the_detector(context, queue, monkeypatch, shape, sigma, lanes):
-    monkeypatch.setattr("clra.ops.images.blur.lanes", lambda context: lanes)
+def test_is_the_mean_of_what_lies_on_the_detector(context, queue, form, shape, sigma):
     images = np.random.default_rng(0).normal(size=(2, *shape))
     image = to_device(context, np.stack([lined(i) for i in images]))
     blank = np.zeros((2, shape[0], line_stride(shape[1])))

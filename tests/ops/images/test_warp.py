@@ -4,7 +4,6 @@ import pyopencl.array as cl_array
 import pytest
 from scipy import ndimage
 
-from clra.ops.images import warp
 from clra.ops.images.warp import Warp
 
 IDENTITY = 1e-6  # of values up to 1: rounding of the coefficients
@@ -89,15 +88,14 @@ def test_wide_detectors_keep_the_fraction_of_a_pixel(context, queue):
     np.testing.assert_allclose(found[inner], expected, rtol=0, atol=SPLINE)
 
 
-def test_any_chunk_gives_the_same(context, queue, monkeypatch):
+def test_any_chunk_gives_the_same(context, queue):
     image = images(5, (20, 33))
     rng = np.random.default_rng(3)
     motion = np.column_stack([rng.uniform(-3, 3, (5, 2)), rng.uniform(0.98, 1.02, 5)])
     motion = motion.astype(np.float32)
     expected = run(context, queue, image, motion)
-    monkeypatch.setattr(warp, "_CPU_BYTES", 2 * 4 * 20 * 80)  # two images at a time
-    monkeypatch.setattr(warp, "_GPU_BYTES", 2 * 4 * 20 * 80)
-    operator = Warp(context, (20, 33))
+    two_images = 2 * 4 * 20 * 80
+    operator = Warp(context, (20, 33), scratch_limit=2 * two_images)
     device, moves = cl_array.to_device(queue, image), cl_array.to_device(queue, motion)
     for part in (slice(1, 2), slice(2, 5), slice(0, 1)):
         operator(queue, device[part], device[part], moves[part])  # in place, with an offset

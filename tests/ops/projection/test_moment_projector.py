@@ -17,14 +17,14 @@ from .test_projector import joseph
 SPHERE = 8e-3  # root mean square over the largest
 
 
-def moments(queue, geometry, grid, volume, **form):
-    """Both integrals, in a form of the kernels."""
-    operator = ForwardProjector(queue.context, geometry, grid, _moment=True, **form)
+def moments(queue, geometry, grid, volume):
+    """Both integrals."""
+    operator = MomentProjector(queue.context, geometry, grid)
     out = [
         cl_array.empty(queue, (geometry.views, *geometry.shape), np.float32).fill(np.nan)
         for _ in range(2)
     ]
-    operator._run(queue, tuple(out), on_device(queue, volume), None, False, None).wait()
+    operator.moments(queue, *out, on_device(queue, volume)).wait()
     return [one.get() for one in out]
 
 
@@ -32,7 +32,7 @@ def moments(queue, geometry, grid, volume, **form):
 @geometries
 def test_moments_against_float64(queue, geometry, form):
     volume = numbers(*GRID.shape)
-    found = moments(queue, geometry, GRID, volume, **form)
+    found = moments(queue, geometry, GRID, volume)
     for integral, over_depth in zip(found, (False, True), strict=True):
         expected = joseph(geometry, GRID, over_depth=over_depth) @ volume.ravel()
         assert_close(integral, expected.reshape(integral.shape))

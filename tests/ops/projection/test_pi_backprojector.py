@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pyopencl.array as cl_array
 import pytest
+from projector_cases import all_forms
 
 from clra.model.grid import VolumeGrid
 from clra.model.helix.helix import Helix
@@ -76,20 +77,20 @@ def parts(helix: Helix, grid: VolumeGrid) -> np.ndarray:
     return np.clip(np.minimum(z - spans[..., 0], spans[..., 1] - z) / BLEND, 0, 1)
 
 
-def back_projected(context, queue, helices, which, projections, lanes=None, grid=GRID):
-    operator = PiBackProjector(context, helices, which, grid, RADIUS, _lanes=lanes)
+def back_projected(context, queue, helices, which, projections, grid=GRID):
+    operator = PiBackProjector(context, helices, which, grid, RADIUS)
     nz, ny, nx = grid.shape
     volume = cl_array.zeros(queue, (ny, nx, nz), np.float32)
     operator(queue, volume, cl_array.to_device(queue, projections)).wait()
     return volume.get()
 
 
-@pytest.mark.parametrize("lanes", [1, 8])
+@all_forms
 @pytest.mark.parametrize("name", HELICES)
-def test_back_projection_is_the_sum(context, queue, name, lanes):
+def test_back_projection_is_the_sum(context, queue, name, form):
     helix = HELICES[name]
     projections = projections_of(helix)
-    found = back_projected(context, queue, [helix], 0, projections, lanes)
+    found = back_projected(context, queue, [helix], 0, projections)
     expected = summed(helix, projections, GRID) * (parts(helix, GRID) > 0)
     assert (expected != 0).mean() > 0.3
     assert np.abs(found - expected).max() <= RELATIVE * np.abs(expected).max()

@@ -1,5 +1,7 @@
 """How the projectors are called: views in parts, slabs, orders of axes, offsets, and refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
@@ -21,6 +23,7 @@ from projector_cases import (
 from clra import VolumeGrid, circular
 from clra.ops.projection import layout, projector
 from clra.ops.projection.projector import BackProjector, ForwardProjector
+from clra.ops.runtime.profile import forced
 
 
 def test_set_geometry_is_a_new_operator(queue):
@@ -44,31 +47,32 @@ def test_set_geometry_is_a_new_operator(queue):
 def test_a_view_that_misses_the_volume_gives_nothing(queue, form):
     geometry = circular(1, **DETECTOR)
     grid = VolumeGrid(shape=(9, 8, 7), voxel_size=1.0, centre=(0.0, 0.0, 60.0))
-    assert not forward(queue, geometry, grid, numbers(*grid.shape), **form).any()
+    assert not forward(queue, geometry, grid, numbers(*grid.shape)).any()
     projections = numbers(1, *geometry.shape)
-    assert not back(queue, geometry, grid, projections, **form).any()
-    assert not back(queue, geometry, grid, projections, matched=True, **form).any()
+    assert not back(queue, geometry, grid, projections).any()
+    assert not back(queue, geometry, grid, projections, matched=True).any()
 
 
 @pytest.mark.parametrize("small", [False, True], ids=["at once", "in parts"])
 @forms
-def test_views_may_come_in_chunks(queue, monkeypatch, form, small):
+def test_views_may_come_in_chunks(queue, monkeypatch, request, form, small):
     if small:  # scratch for two views, parts of two planes
-        monkeypatch.setattr(layout, "_CPU_BYTES", 0)
-        monkeypatch.setattr(layout, "_GPU_BYTES", 0)
         monkeypatch.setattr(layout, "_LEAST_VIEWS", 2)
         monkeypatch.setattr(projector, "_PART_BYTES", 0)
         monkeypatch.setattr(projector, "_LEAST_PLANES", 2)
+        tight = forced(replace(form, projector_bytes=0))
+        tight.__enter__()
+        request.addfinalizer(lambda: tight.__exit__(None, None, None))
     geometry = GEOMETRIES["space-filling"]
     volume, projections = numbers(*GRID.shape), numbers(geometry.views, *geometry.shape)
     chunks = [slice(0, 3), slice(3, None)]
-    operator = ForwardProjector(queue.context, geometry, GRID, **form)
+    operator = ForwardProjector(queue.context, geometry, GRID)
     for chunk in chunks:
         out = cl_array.empty(queue, projections[chunk].shape, np.float32)
         operator(queue, out, on_device(queue, volume), views=chunk)
-        assert_close(out.get(), forward(queue, geometry, GRID, volume, **form)[chunk])
+        assert_close(out.get(), forward(queue, geometry, GRID, volume)[chunk])
     for matched in False, True:
-        options = {"matched": matched, **form}
+        options = {"matched": matched}
         operator = BackProjector(queue.context, geometry, GRID, **options)
         out = on_device(queue, np.full(GRID.shape, np.nan))
         for chunk in chunks:
@@ -82,17 +86,17 @@ def test_accumulating_adds(queue, form):
     geometry = GEOMETRIES["circle"]
     volume, projections = numbers(*GRID.shape), numbers(geometry.views, *geometry.shape)
     out = on_device(queue, projections)
-    operator = ForwardProjector(queue.context, geometry, GRID, **form)
+    operator = ForwardProjector(queue.context, geometry, GRID)
     operator(queue, out, on_device(queue, volume), accumulate=True)
-    assert_close(out.get(), projections + forward(queue, geometry, GRID, volume, **form))
+    assert_close(out.get(), projections + forward(queue, geometry, GRID, volume))
     for order, axes in ("zyx", (0, 1, 2)), ("yxz", (1, 2, 0)):
         for matched in False, True:
             operator = BackProjector(
-                queue.context, geometry, GRID, matched=matched, volume_order=order, **form
+                queue.context, geometry, GRID, matched=matched, volume_order=order
             )
             out = on_device(queue, volume.transpose(axes))
             operator(queue, out, on_device(queue, projections), accumulate=True)
-            added = back(queue, geometry, GRID, projections, matched=matched, **form)
+            added = back(queue, geometry, GRID, projections, matched=matched)
             assert_close(out.get(), (volume + added).transpose(axes))
 
 
@@ -112,13 +116,13 @@ def test_the_devices_own_order(queue, form):
     volume, projections = numbers(*GRID.shape), numbers(geometry.views, *geometry.shape)
     columns = on_device(queue, volume.transpose(1, 2, 0))
     out = cl_array.empty(queue, projections.shape, np.float32)
-    ForwardProjector(queue.context, geometry, GRID, volume_order="yxz", **form)(queue, out, columns)
-    assert np.array_equal(out.get(), forward(queue, geometry, GRID, volume, **form))
+    ForwardProjector(queue.context, geometry, GRID, volume_order="yxz")(queue, out, columns)
+    assert np.array_equal(out.get(), forward(queue, geometry, GRID, volume))
     for matched in False, True:
-        BackProjector(queue.context, geometry, GRID, matched=matched, volume_order="yxz", **form)(
+        BackProjector(queue.context, geometry, GRID, matched=matched, volume_order="yxz")(
             queue, columns, on_device(queue, projections)
         )
-        expected = back(queue, geometry, GRID, projections, matched=matched, **form)
+        expected = back(queue, geometry, GRID, projections, matched=matched)
         assert np.array_equal(columns.get(), expected.transpose(1, 2, 0))
 
 

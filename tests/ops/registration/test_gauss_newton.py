@@ -12,9 +12,10 @@ from clra.ops.images.bandpass import Bandpass
 from clra.ops.registration import gauss_newton
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
 from clra.ops.registration.windows import registration_window
-from clra.ops.runtime import build
-from clra.ops.runtime.kernel import Step, to_device
+from clra.ops.runtime.buffers import to_device
+from clra.ops.runtime.kernel import Step
 from clra.ops.runtime.lines import MARGIN, line_stride
+from clra.ops.runtime.profile import GPU, device_of, forced
 
 # Errors on 256 x 256 pixels, median over pairs.
 SHIFT_BAR, MAGNIFICATION_BAR = 0.03, 2e-4
@@ -294,12 +295,12 @@ def test_sums_of_the_normal_equations(context, queue, group):
             np.testing.assert_array_less(abs(found[block] - expected[upper]), SUM * norm[upper])
 
 
-def test_gpu_form_agrees(context, queue, monkeypatch):
+def test_gpu_form_agrees(context, queue):
     """Work-groups that share a view, a pixel an item, the device's own FFT."""
     measured, simulated, _ = pairs(3, (60, 72), 4.0, counts=2000)
     expected = run(context, queue, measured, simulated)
-    monkeypatch.setattr(build, "is_cpu", lambda device: False)
-    found = run(context, queue, measured, simulated)
+    with forced(GPU):
+        found = run(context, queue, measured, simulated)
     for name in ("shift_u", "shift_v"):
         np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=2e-3)
     np.testing.assert_allclose(found["magnification"], expected["magnification"], atol=5e-5)
@@ -457,7 +458,7 @@ def test_bad_arrays_are_refused(context, queue):
         operator(queue, out, good, good[:1])
     with pytest.raises(ValueError, match="estimates_out: found shape"):
         operator(queue, out[:1], good, good)
-    other = cl.Context([build.device_of(context)])
+    other = cl.Context([device_of(context)])
     foreign = cl_array.zeros(cl.CommandQueue(other), (2, 64, 80), np.float32)
     with pytest.raises(ValueError, match="simulated: its context"):
         operator(queue, out, good, foreign)

@@ -9,7 +9,7 @@ from scipy import ndimage
 from clra.ops.images.bandpass import Bandpass
 from clra.ops.registration.phase_correlation import CoarseShift, PhaseCorrelation
 from clra.ops.registration.windows import registration_window, tukey
-from clra.ops.runtime import build
+from clra.ops.runtime.profile import device_of
 
 SAME = 2e-3  # pixels, against the same steps in float64
 BIAS = 0.2  # pixels: a parabola through a peak that is none, and a window that stands still
@@ -177,7 +177,7 @@ def test_bad_arrays_are_refused(context, queue):
         operator(queue, out, cl_array.zeros(queue, (2, 80, 64), np.float32), good)
     with pytest.raises(ValueError, match="shifts_out: found shape"):
         operator(queue, out[:1], good, good)
-    other = cl.Context([build.device_of(context)])
+    other = cl.Context([device_of(context)])
     foreign = cl_array.zeros(cl.CommandQueue(other), (2, 64, 80), np.float32)
     with pytest.raises(ValueError, match="simulated: its context"):
         operator(queue, out, good, foreign)

@@ -6,6 +6,7 @@ import re
 import types
 from pathlib import Path
 
+import pyopencl as cl
 import pytest
 
 from clra.errors import ClraWarning
@@ -26,6 +27,11 @@ CPUS = {
     "skylake-avx512": f"{HASWELL} avx512f avx512bw avx512dq avx512vl",
 }
 TRIPLE = b"x86_64-unknown-linux-gnu"
+
+
+def version(cpu: str) -> str:
+    """What the device says of itself."""
+    return f"OpenCL 3.0 PoCL HSTR: pthread-{TRIPLE.decode()}-{cpu}"
 
 
 class Record:
@@ -52,7 +58,7 @@ def test_a_record_gets_the_cpu_of_the_variant(cpu):
     before = list(record.words)
     found = pocl.cpu_of_variant(frozenset(CPUS[cpu].split()))
     assert found == cpu
-    assert pocl.pair_record(record.address, found)
+    assert pocl.pair_record(record.address, version("znver3"), found)
     assert [record.text(place) for place in range(3)] == [TRIPLE, cpu.encode(), b"other"]
     changed = [place for place in range(256) if record.words[place] != before[place]]
     assert changed == [record.first + 2]
@@ -73,7 +79,7 @@ def test_a_cpu_that_is_no_x86_has_no_variant():
 @pytest.mark.parametrize("at", [16, 632, 1000])
 def test_a_generic_name_is_replaced_wherever_the_record_has_it(at):
     record = Record(TRIPLE, b"generic", at=at)
-    assert pocl.pair_record(record.address, "haswell")
+    assert pocl.pair_record(record.address, version("generic"), "haswell")
     assert record.text(1) == b"haswell"
 
 
@@ -86,26 +92,35 @@ def test_a_generic_name_is_replaced_wherever_the_record_has_it(at):
         (TRIPLE, b""),
         (TRIPLE,),
         (b"znver3", TRIPLE),
+        (TRIPLE, b"avx2", b"znver3"),  # Debian's 3.1 has the variant between the two
+        (TRIPLE, b"znver4"),
         (TRIPLE, b"a" * 80),
     ],
 )
 def test_a_record_that_is_not_as_expected_is_left_alone(texts):
     record = Record(*texts)
     before = bytes(record.words)
-    assert not pocl.pair_record(record.address, "haswell")
+    assert not pocl.pair_record(record.address, version("znver3"), "haswell")
     assert bytes(record.words) == before
 
 
 def test_a_record_that_is_right_is_left_alone():
     record = Record(TRIPLE, b"haswell")
     before = bytes(record.words)
-    assert pocl.pair_record(record.address, "haswell")
+    assert pocl.pair_record(record.address, version("znver3"), "haswell")
     assert bytes(record.words) == before
 
 
+def test_a_name_that_was_given_can_be_replaced():
+    record = Record(TRIPLE, b"znver3")
+    for name in ("skylake-avx512", "haswell", "skylake-avx512"):
+        assert pocl.pair_record(record.address, version("znver3"), name)
+        assert record.text(1) == name.encode()
+
+
 def test_memory_that_is_not_there_or_not_writable_is_not_touched():
-    assert not pocl.pair_record(0, "haswell")
-    assert not pocl.pair_record(2**47 - 4096, "haswell")
+    assert not pocl.pair_record(0, "", "haswell")
+    assert not pocl.pair_record(2**47 - 4096, "", "haswell")
     record = Record(TRIPLE, b"znver3")
     page = mmap.mmap(-1, mmap.PAGESIZE)
     page.write(bytes(record.words))
@@ -113,23 +128,35 @@ def test_memory_that_is_not_there_or_not_writable_is_not_touched():
     address = ctypes.addressof(view)
     libc = ctypes.CDLL(None, use_errno=True)
     assert libc.mprotect(ctypes.c_void_p(address), mmap.PAGESIZE, mmap.PROT_READ) == 0
-    assert not pocl.pair_record(address, "haswell")
+    assert not pocl.pair_record(address, version("znver3"), "haswell")
     assert record.text(1) == b"znver3"
     assert libc.mprotect(ctypes.c_void_p(address), mmap.PAGESIZE, 3) == 0
     del view
     page.close()
 
 
-def device(version: str, record: Record, name: str = "Portable Computing Language"):
-    platform = types.SimpleNamespace(name=name, version=version)
-    return types.SimpleNamespace(platform=platform, int_ptr=record.address, parent_device=None)
+def device(
+    platform_version: str,
+    record: Record,
+    name: str = "Portable Computing Language",
+    cpu: str = "znver3",
+    kind: int = cl.device_type.CPU,
+) -> types.SimpleNamespace:
+    """As much of a device as the pairing asks for."""
+    return types.SimpleNamespace(
+        platform=types.SimpleNamespace(name=name, version=platform_version),
+        version=version(cpu),
+        type=kind,
+        int_ptr=record.address,
+        parent_device=None,
+    )
 
 
 WHEEL = "OpenCL 3.0 PoCL 3.0-rc2  Linux, Release, RELOC, LLVM 14.0.6, SLEEF, DISTRO, POCL_DEBUG"
 
 
 @pytest.mark.parametrize(
-    ("version", "paired"),
+    ("platform_version", "paired"),
     [
         (WHEEL, True),
         (WHEEL.replace("PoCL 3.0-rc2", "PoCL 3.1+debian"), True),
@@ -140,15 +167,26 @@ WHEEL = "OpenCL 3.0 PoCL 3.0-rc2  Linux, Release, RELOC, LLVM 14.0.6, SLEEF, DIS
         ("OpenCL 3.0 LINUX", False),
     ],
 )
-def test_old_pocls_with_variants_are_paired_and_others_left_alone(version, paired, monkeypatch):
+def test_old_pocls_with_variants_are_paired_and_others_left_alone(
+    platform_version, paired, monkeypatch
+):
     monkeypatch.setattr(pocl, "cpu_flags", lambda: frozenset(HASWELL.split()))
     record = Record(TRIPLE, b"znver3")
-    options = pocl.build_options([device(version, record)])
+    options = pocl.build_options([device(platform_version, record)])
     assert options == (["-DCLRA_POCL_CPU=haswell"] if paired else [])
     assert record.text(1) == (b"haswell" if paired else b"znver3")
     other = Record(TRIPLE, b"znver3")
-    assert pocl.build_options([device(version, other, name="Other")]) == []
+    assert pocl.build_options([device(platform_version, other, name="Other")]) == []
+    assert pocl.build_options([device(platform_version, other, kind=cl.device_type.GPU)]) == []
     assert other.text(1) == b"znver3"
+
+
+def test_a_device_that_has_the_right_name_is_left_alone(monkeypatch):
+    monkeypatch.setattr(pocl, "cpu_flags", lambda: frozenset(HASWELL.split()))
+    record = Record(TRIPLE, b"avx2", b"haswell")
+    before = bytes(record.words)
+    assert pocl.build_options([device(WHEEL, record, cpu="haswell")]) == ["-DCLRA_POCL_CPU=haswell"]
+    assert bytes(record.words) == before
 
 
 def test_a_sub_device_is_paired_with_its_parent(monkeypatch):

@@ -1,152 +1,176 @@
-"""The trial of a device in a child process, and what becomes of its verdict."""
+"""What becomes of the verdict on a device, and of a device that fails."""
 
-import json
 import re
-import sys
 
+import pyopencl as cl
 import pytest
+from broken_devices import ABORTS, BROKEN, HANGS, RIGHT, WRONG, forget, replace_trials
 
-import clra
-from clra.app import cli
-from clra.errors import DeviceError
-from clra.ops.runtime import devices, pocl, self_test, trial
-
-ABORTS = "import os, sys; print('LLVM ERROR: Cannot select: FILD', file=sys.stderr); os.abort()"
-HANGS = "import time; time.sleep(600)"
-WRONG = 'print(\'{"failure": "vectors: wrong numbers, off by 0.5 of the largest", "rate": null}\')'
-RIGHT = 'print(\'{"failure": "", "rate": null}\')'
-CRASHES = "import ctypes; ctypes.string_at(0)"
-BROKEN = {
-    "aborts": (ABORTS, r"ended by SIGABRT \(LLVM ERROR: Cannot select: FILD\)"),
-    "crashes": (CRASHES, "ended by SIGSEGV"),
-    "hangs": (HANGS, "does not come to an end within 1 s"),
-    "wrong": (WRONG, "vectors: wrong numbers, off by 0.5"),
-}
+from clra.errors import ClraWarning, DeviceError
+from clra.ops.runtime import devices, pocl, self_test
 
 
-@pytest.fixture(autouse=True)
-def own_cache(monkeypatch, tmp_path):
-    """Nothing is known of any device, and what is found out stays here."""
-    monkeypatch.setattr(self_test, "_verdicts", {})
-    monkeypatch.setattr(self_test, "cache_folder", lambda: tmp_path)
-    monkeypatch.delenv(self_test.VARIABLE, raising=False)
-    yield tmp_path
-    pocl.prefer_cpu(None)
-
-
-def children(monkeypatch, *codes):
-    """Let the trials be these programs, one after the other, the last one over and over."""
-    left, asked = list(codes), []
-
-    def command(request):
-        asked.append(json.loads(request))
-        return [sys.executable, "-c", left.pop(0) if len(left) > 1 else left[0]]
-
-    monkeypatch.setattr(self_test, "_command", command)
-    monkeypatch.setattr(self_test, "SECONDS", 1.0)
-    return asked
-
-
+@pytest.mark.broken_device
 def test_the_device_of_these_tests_passes(device_failure):
     assert device_failure == ""
 
 
-def test_every_case_of_the_trial_is_right_here(queue):
-    for name, (case, tolerance) in trial.CASES.items():
-        found, expected = case(queue)
-        assert found.size, name
-        error = abs(found - expected).max() / abs(expected).max()
-        assert error < tolerance, name
+@pytest.fixture(autouse=True)
+def folder(monkeypatch, tmp_path):
+    forget(monkeypatch, tmp_path)
+    monkeypatch.delenv("CLRA_DEVICE", raising=False)
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    yield tmp_path
+    pocl.prefer_cpu(None)
 
 
-def test_trial_refuses_another_device_than_was_meant():
-    with pytest.raises(LookupError, match="is another one here"):
-        index = devices.devices()[0].index
-        trial.main(json.dumps({"index": index, "identity": ["x"], "cpu": None, "rate": False}))
+@pytest.fixture
+def only(monkeypatch):
+    """One device, which no narrower CPU name helps."""
+    device = devices.choose_device()
+    monkeypatch.setattr(devices, "_all_devices", lambda: [("0:0", device)])
+    monkeypatch.setattr(pocl, "needs_pairing", lambda device: False)
+    return device
 
 
-@pytest.mark.parametrize(
-    ("name", "kernel", "defect"),
-    [
-        ("forward projection", "forwardproject_columns.cl", ("fma(", "mad24_(")),
-    ],
-)
-def test_what_does_not_build_is_a_failure(queue, monkeypatch, name, kernel, defect):
-    source = clra.kernels.source
-    monkeypatch.setattr(
-        clra.kernels,
-        "source",
-        lambda file: (
-            source(file) + "\nthis is no C;" if file.startswith("forward") else source(file)
-        ),
-    )
-    assert re.match(r"forward projection: kernel forward.* does not build", trial.failure(queue))
+@pytest.fixture
+def two(monkeypatch, only):
+    """The same device twice, the second a copy that is less liked."""
+    other = cl.Device.from_int_ptr(only.int_ptr)
+    monkeypatch.setattr(self_test, "_key", lambda device: "one" if device is only else "two")
+    found = [("0:0", only), ("1:0", _Other(other))]
+    monkeypatch.setattr(devices, "_all_devices", lambda: found)
+    return found
 
 
-def test_wrong_numbers_are_a_failure(queue, monkeypatch):
-    def half(queue):
-        found, expected = trial.vectors(queue)
-        return found * 1.001, expected
+class _Other:
+    """A device of another name."""
 
-    monkeypatch.setitem(trial.CASES, "vectors", (half, trial.TOLERANCE))
-    assert trial.failure(queue) == "vectors: wrong numbers, off by 0.001 of the largest"
-    monkeypatch.setitem(
-        trial.CASES, "vectors", (lambda queue: (half(queue)[0] * float("nan"), half(queue)[1]), 1.0)
-    )
-    assert "wrong numbers, off by nan" in trial.failure(queue)
+    name, max_compute_units, parent_device = "other", 1, None
+
+    def __init__(self, device):
+        self._device = device
+
+    def __getattr__(self, name):
+        return getattr(self._device, name)
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_a_broken_device_gives_a_device_error(how, monkeypatch):
-    code, words = BROKEN[how]
-    children(monkeypatch, code)
-    with pytest.raises(DeviceError, match=words) as raised:
+def test_a_broken_device_is_a_device_error_of_one_line(how, monkeypatch, only):
+    program, words = BROKEN[how]
+    replace_trials(monkeypatch, [program])
+    with pytest.raises(DeviceError, match=rf"fails clra's self-test: {words}") as raised:
         devices.usable_device()
-    assert "\n" not in str(raised.value)
-    assert "fails clra's self-test" in str(raised.value)
-    assert "pip install 'clra[pocl]'" in str(raised.value)
+    line = str(raised.value)
+    assert "\n" not in line
+    assert "pip install 'clra[pocl]'" in line and "clra devices --test" in line
 
 
-@pytest.mark.parametrize("how", BROKEN)
-def test_align_on_a_broken_device(how, monkeypatch, tmp_path, capsys, small_scan):
-    code, words = BROKEN[how]
-    children(monkeypatch, code)
-    with pytest.raises(DeviceError, match=words):
-        clra.align(small_scan)
-    path = tmp_path / "scan.nxs"
-    write_small(path, small_scan)
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["align", str(path), "-o", str(tmp_path / "motion.h5"), "--quiet"])
-    assert ended.value.code == 1
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert re.match(rf"error: .*fails clra's self-test: .*{words}", line)
-
-
-def test_a_verdict_is_kept_and_read_by_another_process(monkeypatch, own_cache):
-    asked = children(monkeypatch, RIGHT)
-    told = []
+def test_a_trial_is_had_once_and_told_of(monkeypatch, only, folder):
+    asked, told = replace_trials(monkeypatch, [RIGHT]), []
     for _ in range(2):
-        devices.usable_device(progress=told.append)
-    assert len(asked) == len(told) == 1
-    assert told[0].stage == self_test.STAGE
+        assert devices.usable_device(progress=told.append) is only
+    assert asked == [
+        {"index": "0:0", "identity": self_test.identity(only), "cpu": None, "rate": False}
+    ]
+    assert [one.stage for one in told] == [self_test.STAGE]
     self_test._verdicts.clear()  # as another process
     devices.usable_device()
     assert len(asked) == 1
-    (file,) = own_cache.iterdir()
-    file.write_text("{")  # damaged
+    (file,) = folder.iterdir()
+    file.write_text('{"failure"')  # damaged
     self_test._verdicts.clear()
     devices.usable_device()
     assert len(asked) == 2
 
 
-def test_a_failure_is_kept_but_not_that_it_took_too_long(monkeypatch):
-    for code, trials in ((WRONG, 1), (HANGS, 2)):
-        asked = children(monkeypatch, code)
-        monkeypatch.setattr(pocl, "needs_pairing", lambda device: False)
-        for _ in range(2):
-            self_test._verdicts.clear()
-            with pytest.raises(DeviceError):
-                devices.usable_device()
-        assert len({json.dumps(one) for one in asked}) == len(devices.devices())
-        assert len(asked) == trials * len(devices.devices())
-        [file.unlink() for file in self_test.cache_folder().iterdir()]
+def test_what_a_verdict_is_kept_for(monkeypatch, only):
+    key = self_test._key(only)
+    assert key == self_test._key(only)
+    identity = self_test.identity(only)
+    monkeypatch.setattr(self_test, "identity", lambda device: [*identity[:-1], "other driver"])
+    assert self_test._key(only) != key
+    monkeypatch.setattr(self_test, "identity", lambda device: identity)
+    monkeypatch.setattr(self_test, "_clra_version", lambda: "99")
+    assert self_test._key(only) != key
+
+
+@pytest.mark.parametrize(("program", "trials"), [(WRONG, 1), (ABORTS, 1), (HANGS, 2)])
+def test_a_failure_is_kept_unless_it_was_only_slow(monkeypatch, only, program, trials):
+    asked = replace_trials(monkeypatch, [program])
+    for _ in range(2):
+        self_test._verdicts.clear()
+        with pytest.raises(DeviceError):
+            devices.usable_device()
+    assert len(asked) == trials
+
+
+def test_a_narrower_cpu_is_tried_and_taken_from_then_on(monkeypatch, only):
+    monkeypatch.setattr(pocl, "needs_pairing", lambda device: True)
+    monkeypatch.setattr(pocl, "cpu_flags", lambda: frozenset(VARIANT_OF_HASWELL | {"avx512f"}))
+    asked = replace_trials(monkeypatch, [ABORTS, WRONG, RIGHT])
+    assert devices.usable_device() is only
+    assert [one["cpu"] for one in asked] == [None, "haswell", "x86-64"]
+    assert pocl._preferred == "x86-64"
+    pocl.prefer_cpu(None)
+    self_test._verdicts.clear()
+    devices.usable_device()
+    assert pocl._preferred == "x86-64" and len(asked) == 3
+
+
+VARIANT_OF_HASWELL = {"sse2"} | next(flags for _, cpu, flags in pocl.VARIANTS if cpu == "haswell")
+
+
+def test_another_device_stands_in_unless_one_was_asked_for(monkeypatch, two):
+    replace_trials(monkeypatch, [ABORTS, RIGHT])
+    with pytest.warns(ClraWarning, match=r"fails clra's self-test.*: other .* is used instead"):
+        assert devices.usable_device() is two[1][1]
+    with pytest.raises(DeviceError, match=r"fails clra's self-test.*choose another with --device"):
+        devices.usable_device("0:0")
+    monkeypatch.setenv("CLRA_DEVICE", "0:0")
+    with pytest.raises(DeviceError, match="fails clra's self-test"):
+        devices.usable_device()
+
+
+def test_only_devices_that_pass_share_work(monkeypatch, only):
+    replace_trials(monkeypatch, [RIGHT])
+    assert devices.usable_devices("all") == [only]
+    assert devices.usable_devices() == [only]
+
+
+def test_it_can_be_turned_off(monkeypatch, only):
+    asked = replace_trials(monkeypatch, [ABORTS])
+    monkeypatch.setenv(self_test.VARIABLE, "0")
+    assert devices.usable_device() is only
+    assert asked == []
+    assert not self_test.verdict(only, "0:0").tested
+
+
+@pytest.mark.parametrize("executable", ["", "/opt/app/viewer", "/nowhere/python3"])
+def test_where_no_python_can_be_started_devices_are_taken_untested(monkeypatch, only, executable):
+    monkeypatch.setattr(self_test.sys, "executable", executable)
+    assert devices.usable_device() is only
+    assert not self_test.verdict(only, "0:0").tested
+
+
+def test_a_trial_that_finds_no_modules_says_nothing_of_the_device(monkeypatch, only):
+    replace_trials(monkeypatch, ["import no_such_module"])
+    assert not self_test.verdict(only, "0:0").tested
+    assert devices.usable_device() is only
+
+
+def test_sub_devices_are_as_good_as_the_device(monkeypatch, only):
+    if only.partition_max_sub_devices < 2:
+        pytest.skip("the device has no sub-devices")
+    asked = replace_trials(monkeypatch, [RIGHT])
+    parts = only.create_sub_devices([cl.device_partition_property.EQUALLY, 1])
+    assert devices.usable_device(parts[0]) is parts[0]
+    assert len(asked) == 1
+
+
+def test_the_real_trial_passes_in_its_process(monkeypatch):
+    info = devices.devices()[0]
+    found = self_test.verdict(devices.device_at(info.index), info.index, rate=True)
+    assert found.tested and found.passed, found
+    assert found.rate and found.rate > 0
+    assert re.fullmatch(r"[0-9a-f]{24}", self_test._key(devices.device_at(info.index)))

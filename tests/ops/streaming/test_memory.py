@@ -6,8 +6,8 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from clra.ops.runtime import build
 from clra.ops.runtime.devices import create_context
+from clra.ops.runtime.profile import device_of, profile_of
 from clra.ops.streaming.memory import (
     Budgets,
     DeviceMemory,
@@ -80,8 +80,8 @@ def test_store_returns_what_was_written(budget):
 
 
 def test_budget_of_a_cpu_is_part_of_the_host_s(context):
-    device = build.device_of(context)
-    if not build.is_cpu(device):
+    device = device_of(context)
+    if not profile_of(device).shared_memory:
         pytest.skip("no CPU device")
     budgets = Budgets.of(device, 80 << 20, 100 << 20)
     assert budgets.device == 50 << 20
@@ -92,4 +92,4 @@ def test_budget_of_a_cpu_is_part_of_the_host_s(context):
 def test_a_budget_is_positive(context, name):
     given = {"max_device_memory": None, "max_host_memory": None, name: -1}
     with pytest.raises(ValueError, match=f"{name}: found -1, expected a positive number"):
-        Budgets.of(build.device_of(context), given["max_device_memory"], given["max_host_memory"])
+        Budgets.of(device_of(context), given["max_device_memory"], given["max_host_memory"])

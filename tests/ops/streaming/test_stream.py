@@ -1,12 +1,14 @@
 """Chunks, slabs and binned radiographs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import clra
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.grid import VolumeGrid
-from clra.ops.runtime import build
+from clra.ops.runtime.profile import CPU, forced
 from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -87,16 +89,15 @@ def test_full_resolution_is_read_where_needed():
 
 
 @pytest.mark.parametrize("budget", [None, 40 << 10])
-def test_a_device_with_its_own_memory_gets_copies(budget, monkeypatch):
+def test_a_device_with_its_own_memory_gets_copies(budget):
     """As on a GPU: radiographs are copied on a queue beside the one that works on them."""
     geometry = clra.circular(60, shape=(12, 16), **DETECTOR)
     grid = VolumeGrid(shape=(9, 10, 11), voxel_size=0.5)
     pixels = np.random.default_rng(2).random((60, 12, 16), np.float32)
     volumes = []
     for shared in (True, False):
-        monkeypatch.setattr(build, "is_cpu", lambda device, shared=shared: shared)
-        stream = Stream(max_device_memory=budget)
-        monkeypatch.undo()
+        with forced(replace(CPU, shared_memory=shared)):
+            stream = Stream(max_device_memory=budget)
         assert stream.budgets.shared == shared
         radiographs = Radiographs(stream, clra.Scan(pixels, geometry), 1)
         volumes.append(ramp_fbp(stream, radiographs, geometry, grid).to_host())
