@@ -59,6 +59,11 @@ class MomentProjector(ForwardProjector):
         """
         names = ("volume", "over_depth_out")
         self._layout.check(queue, names, volume, over_depth_out, views)
-        return self._run(
-            queue, (projections_out, over_depth_out), volume, views, accumulate, wait_for
+        return self.integrals(
+            queue,
+            (projections_out, over_depth_out),
+            volume,
+            views=views,
+            accumulate=accumulate,
+            wait_for=wait_for,
         )

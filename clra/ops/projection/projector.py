@@ -141,18 +141,26 @@ class ForwardProjector:
         TypeError, InputError
             If an argument is none of the above.
         """
-        return self._run(queue, (projections_out,), volume, views, accumulate, wait_for)
+        return self.integrals(
+            queue,
+            (projections_out,),
+            volume,
+            views=views,
+            accumulate=accumulate,
+            wait_for=wait_for,
+        )
 
-    def _run(
+    def integrals(
         self,
         queue: cl.CommandQueue,
         outputs: tuple[Array, ...],
         volume: Array,
-        views: slice | None,
-        accumulate: bool,
-        wait_for: Sequence[cl.Event] | None,
+        *,
+        views: slice | None = None,
+        accumulate: bool = False,
+        wait_for: Sequence[cl.Event] | None = None,
     ) -> cl.Event:
-        """Fill one or two integrals of each ray; of two, those of a batch follow each other."""
+        """Fill what the kernels make of each ray: one integral for this class, see `__call__`."""
         layout = self._layout
         names = ("volume", "projections_out")
         start, stop = layout.check(queue, names, volume, outputs[0], views)

@@ -10,6 +10,7 @@ from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.view_selection import runs, views_that_see
+from clra.ops.projection.moment_projector import MomentProjector
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.streaming.memory import Reused
 from clra.ops.streaming.stream import Stream
@@ -103,7 +104,7 @@ class SlabProjector:
         slabs = volume.slabs
         self._seeing = [views_that_see(geometry, slab) for slab in slabs]
         self._projectors = [
-            ForwardProjector(
+            self._PROJECTOR(
                 stream.context,
                 geometry,
                 slab,
@@ -113,6 +114,8 @@ class SlabProjector:
             )
             for slab in slabs
         ]
+
+    _PROJECTOR: type[ForwardProjector] = ForwardProjector
 
     def __call__(self, projections_out: Array, views: slice) -> cl.Event:
         """Project some views, on the stream's queue.
@@ -124,16 +127,21 @@ class SlabProjector:
         views : slice
             The n successive views of the geometry. Slabs that none of them sees are not fetched.
         """
+        return self._over_slabs((projections_out,), views)
+
+    def _over_slabs(self, outputs: tuple[Array, ...], views: slice) -> cl.Event:
+        """Add up what the slabs give."""
         seen = [
             index for index, views_seeing in enumerate(self._seeing) if views_seeing[views].any()
         ]
         if not seen:
-            projections_out.fill(0.0, queue=self._queue)
+            for out in outputs:
+                out.fill(0.0, queue=self._queue)
             return cl.enqueue_marker(self._queue)
         for index in seen:
-            event = self._projectors[index](
+            event = self._projectors[index].integrals(
                 self._queue,
-                projections_out,
+                outputs,
                 self._volume.get(index),
                 views=views,
                 accumulate=index != seen[0],
@@ -141,6 +149,19 @@ class SlabProjector:
             if len(seen) > 1:
                 event.wait()  # the slab is let go
         return event
+
+
+class SlabMoments(SlabProjector):
+    """Integrals of a volume and of the volume over the depth, slab by slab.
+
+    As :class:`SlabProjector`, with :class:`~clra.ops.projection.moment_projector.MomentProjector`.
+    """
+
+    _PROJECTOR = MomentProjector
+
+    def moments(self, projections_out: Array, over_depth_out: Array, views: slice) -> cl.Event:
+        """Project some views; arrays as for `MomentProjector.moments`."""
+        return self._over_slabs((projections_out, over_depth_out), views)
 
 
 class SlabAdjoint:
