@@ -8,9 +8,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
+    __version__: str
     from clra import kernels as kernels
+    from clra.errors import Cancelled as Cancelled
+    from clra.errors import ClraWarning as ClraWarning
+    from clra.errors import DeviceError as DeviceError
+    from clra.errors import InputError as InputError
+    from clra.errors import OutputError as OutputError
+    from clra.findings import Finding as Finding
+    from clra.io.alignment_file import read_alignment as read_alignment
+    from clra.io.alignment_file import write_alignment as write_alignment
     from clra.io.scan_files import read_scan as read_scan
+    from clra.io.scan_files import write_scan as write_scan
+    from clra.io.volumes.volume_files import write_volume as write_volume
     from clra.methods.alignment.align import align as align
+    from clra.methods.alignment.result import AlignmentResult as AlignmentResult
     from clra.methods.correction import correct as correct
     from clra.methods.reconstruction.reconstruct import reconstruct as reconstruct
     from clra.model.geometry import ConeBeamGeometry as ConeBeamGeometry
@@ -26,6 +38,7 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.ops.projection.projector import BackProjector as BackProjector
     from clra.ops.projection.projector import ForwardProjector as ForwardProjector
     from clra.ops.runtime.devices import devices as devices
+    from clra.progress import Progress as Progress
 
 _HOMES = {
     "ConeBeamGeometry": "clra.model.geometry",
@@ -37,22 +50,38 @@ _HOMES = {
     "Motion": "clra.model.motion",
     "Scan": "clra.model.scan",
     "read_scan": "clra.io.scan_files",
+    "write_scan": "clra.io.scan_files",
+    "read_alignment": "clra.io.alignment_file",
+    "write_alignment": "clra.io.alignment_file",
+    "write_volume": "clra.io.volumes.volume_files",
     "align": "clra.methods.alignment.align",
+    "AlignmentResult": "clra.methods.alignment.result",
     "reconstruct": "clra.methods.reconstruction.reconstruct",
     "correct": "clra.methods.correction",
     "devices": "clra.ops.runtime.devices",
     "ForwardProjector": "clra.ops.projection.projector",
     "BackProjector": "clra.ops.projection.projector",
     "AlignmentStep": "clra.ops.alignment_step",
+    "Finding": "clra.findings",
+    "Progress": "clra.progress",
+    "InputError": "clra.errors",
+    "OutputError": "clra.errors",
+    "DeviceError": "clra.errors",
+    "Cancelled": "clra.errors",
+    "ClraWarning": "clra.errors",
     "as_linear_operator": "clra.ops.projection.linear_operator",
 }
 
-__all__ = ["kernels", *_HOMES]
+__all__ = ["__version__", "kernels", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
     if name == "kernels":
         return import_module("clra.kernels")
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("clra")
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'clra' has no attribute {name!r}")

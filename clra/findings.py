@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from clra.errors import ClraWarning
@@ -48,7 +54,43 @@ class Finding:
         """Return the finding that :meth:`as_dict` wrote."""
         return cls(**values)
 
-    def warn(self, stacklevel: int = 2) -> None:
-        """Issue it as a :class:`clra.errors.ClraWarning`, unless it is mere information."""
-        if self.severity != "info":
-            warnings.warn(str(self), ClraWarning, stacklevel=stacklevel + 1)
+    def warn(self) -> Finding:
+        """Issue it as a :class:`clra.errors.ClraWarning` that points at the line that called clra.
+
+        Mere information is logged instead. Either goes to :func:`collected`.
+        """
+        for findings in _COLLECTING.get():
+            if self not in findings:
+                findings.append(self)
+        if self.severity == "info":
+            _LOG.info("%s", self)
+        else:
+            warnings.warn(str(self), ClraWarning, stacklevel=_callers_level())
+        return self
+
+
+@contextmanager
+def collected() -> Iterator[list[Finding]]:
+    """Yield a list to which every finding that is issued within the block is appended, once."""
+    findings: list[Finding] = []
+    token = _COLLECTING.set((*_COLLECTING.get(), findings))
+    try:
+        yield findings
+    finally:
+        _COLLECTING.reset(token)
+
+
+_LOG = logging.getLogger(__name__)
+_COLLECTING: ContextVar[tuple[list[Finding], ...]] = ContextVar("collecting", default=())
+_PACKAGE = str(Path(__file__).parent)
+
+
+def _callers_level() -> int:
+    """Stack level, for the function that asks, of the frame that called this package."""
+    frame, level, outermost = sys._getframe(1), 1, 1
+    while frame is not None:
+        # Standard library frames between two of ours (contextlib) are no callers.
+        if frame.f_code.co_filename.startswith(_PACKAGE):
+            outermost = level
+        frame, level = frame.f_back, level + 1  # type: ignore[assignment]
+    return outermost + 1

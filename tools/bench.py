@@ -19,6 +19,7 @@ from typing import Any
 import pyopencl as cl
 from bench_cases import CASES, LONG, Bench, Case, Value
 from bench_first_use import first_use
+from bench_host import host
 from bench_peers import PEERS, Peer, threads
 
 from clra.ops.runtime.devices import create_context
@@ -91,7 +92,7 @@ def found(names: Sequence[str]) -> list[Peer]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    short = CASES | {"first-use": first_use}
+    short = CASES | {"first-use": first_use, "host": host}
     everything = short | LONG
     parser.add_argument("--only", action="append", choices=everything, metavar="NAME", default=[])
     parser.add_argument("--long", action="store_true", help=f"also {', '.join(LONG)}")
@@ -103,7 +104,8 @@ def main() -> None:
     names = given.only or [*short, *(LONG if given.long else ())]
     peers = found(given.peer)
     columns = [peer.name for peer in peers]
-    queue = cl.CommandQueue(create_context(given.device))
+    context = create_context(given.device)  # kept: not every driver's queues keep theirs
+    queue = cl.CommandQueue(context)
     about = machine(queue.device)
     print(f"{about['device']}, {about['driver']}, {about['threads']} threads\n")
     print(head(columns), flush=True)

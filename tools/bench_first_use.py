@@ -47,7 +47,8 @@ clra.correct(scan, result.motion).read(0, 4)
 for method in "fbp", "osem-tr", "imgr":
     clra.reconstruct(scan, method=method, grid=grid)
 clra.reconstruct(turns, method="katsevich", grid=clra.VolumeGrid(shape=(9, 32, 32), voxel_size=0.5))
-queue = cl.CommandQueue(create_context(None))
+context = create_context(None)
+queue = cl.CommandQueue(context)
 projections = cl.array.zeros(queue, (16, 64, 64), np.float32)
 volume = cl.array.zeros(queue, grid.shape, np.float32)
 for views in geometry, tilted:
@@ -62,6 +63,25 @@ _IMPORT = """
 import time
 start = time.perf_counter()
 import clra
+print(time.perf_counter() - start, time.process_time())
+"""
+
+
+_DEVICES = """
+import contextlib, io, sys, time
+start = time.perf_counter()
+from clra.app.cli import main
+sys.argv = ["clra", "devices"]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    main()
+print(time.perf_counter() - start, time.process_time())
+"""
+# The child's processor time is not in the second number.
+_SELF_TEST = """
+import time
+from clra.ops.runtime.devices import usable_device
+start = time.perf_counter()
+usable_device()
 print(time.perf_counter() - start, time.process_time())
 """
 
@@ -83,13 +103,16 @@ def first_use(bench: Bench) -> Iterator[Value]:
         return Value(name, size, "s", {"clra": median}, {"clra": seconds}, {"clra": processor})
 
     yield fresh("import clra", "", _IMPORT, {}, 7)
+    yield fresh("clra devices", "", _DEVICES, {}, 7)
     with tempfile.TemporaryDirectory() as folder:
         names = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
         caches = {name: str(Path(folder) / name) for name in names}
         for path in caches.values():
             Path(path).mkdir()
+        yield fresh("self-test, caches empty", "", _SELF_TEST, caches, 1)
+        yield fresh("self-test, verdict kept", "", _SELF_TEST, caches, 7)
         size = "tiny scan aligned, reconstructed, corrected"
-        yield fresh("first use, caches empty", size, _FIRST_USE, caches, 1)
+        yield fresh("first use, caches as the self-test left them", size, _FIRST_USE, caches, 1)
         yield fresh("first use, caches filled", size, _FIRST_USE, caches, 3)
     with tempfile.TemporaryDirectory() as folder:
         caches = {name: folder for name in names}

@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 
 import clra
-from clra.app.records import Record
+from clra.app.annotations import annotated
 from clra.app.report.html_report import write_report
 from clra.app.report.summary import findings_of
+from clra.io.alignment_file import write_alignment
 from clra.io.scan_files import write_scan
 from clra.io.volumes.volume_files import write_volume
 from clra.methods.alignment.result import AlignmentResult
@@ -109,9 +110,9 @@ def keep(folder: Path, scan: clra.Scan, result: AlignmentResult) -> None:
     """Write the scan, the motion and the report."""
     folder.mkdir(parents=True, exist_ok=True)
     write_scan(folder / "scan.nxs", scan)
-    record = Record.of(result, scan)
-    record.save(folder / "motion.h5")
-    write_report(folder / "report.html", findings_of(record, scan))
+    result = annotated(result, scan)
+    write_alignment(folder / "motion.h5", result)
+    write_report(folder / "report.html", findings_of(result, scan))
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ INK, BLUE, ORANGE = "#1f2933", "#0072b2", "#d55e00"
 
 def main(folder: Path, target: Path) -> None:
     scan = clra.read_scan(folder / "scan.nxs")
-    found, truth = clra.Motion.load(folder / "motion.h5"), scan.truth
+    found, truth = clra.read_alignment(folder / "motion.h5").motion, scan.truth
     assert truth is not None  # a simulated scan
     plt.rcParams.update({"font.size": 8, "text.color": INK, "axes.edgecolor": INK})
     figure, axes = plt.subplots(

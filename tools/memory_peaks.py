@@ -53,7 +53,8 @@ def child(method: str, scan_path: Path, out: Path, host: int | None, device: int
 
     def run(scan: clra.Scan, name: Path, **limits: int | None) -> None:
         if method == "align":
-            clra.align(scan, schedule="2QR-1HR", estimate="shift", **limits).motion.save(name)
+            result = clra.align(scan, schedule="2QR-1HR", estimate="shift", **limits)
+            clra.write_alignment(name, result)
         else:
             grid = default_grid(scan.geometry)
             with open_volume(name, grid) as target:
@@ -141,7 +142,7 @@ def difference(method: str, one: Path, other: Path) -> str:
     from clra.io.volumes.volume_files import read_volume
 
     if method == "align":
-        first, second = clra.Motion.load(one), clra.Motion.load(other)
+        first, second = (clra.read_alignment(path).motion for path in (one, other))
         return f"{np.abs(first.shift_u - second.shift_u).max():.1e} px"
     first, second = (read_volume(path)[0] for path in (one, other))
     return f"{np.linalg.norm(first - second) / np.linalg.norm(first):.1e}"

@@ -107,8 +107,6 @@ def runs(quick: bool) -> dict[str, Run]:
             {**rusticl, "CLRA_DEVICE": "rusticl"},
             "llvmpipe",
             icds=(RUSTICL,),
-            # Its launches take several times as long behind events, which the bare ones lack.
-            more=("-k", "not costs_little"),
         ),
         "two-devices": Run(
             ("tests/ops/test_embedding.py",),

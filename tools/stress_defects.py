@@ -29,7 +29,7 @@ class Scene:
         Of the scan.
     strength : float
         How much is to be spoilt.
-    believed : Stage
+    assumed : Stage
         What `reported` was made from.
     """
 
@@ -39,7 +39,7 @@ class Scene:
     actual: clra.ConeBeamGeometry
     seed: int
     strength: float
-    believed: Stage
+    assumed: Stage
 
     @property
     def random(self) -> np.random.Generator:
@@ -119,18 +119,18 @@ def half_fan(scene: Scene) -> Scene:
     )
 
 
-def turned_back(scene: Scene) -> Scene:
+def opposite_sense(scene: Scene) -> Scene:
     """Report the other sense of rotation."""
-    return replace(scene, reported=_with_angles(scene, -scene.believed.angle))
+    return replace(scene, reported=_with_angles(scene, -scene.assumed.angle))
 
 
 def angles_scaled(scene: Scene) -> Scene:
     """Report angles in a wrong unit, or of another number of steps a turn."""
-    return replace(scene, reported=_with_angles(scene, scene.strength * scene.believed.angle))
+    return replace(scene, reported=_with_angles(scene, scene.strength * scene.assumed.angle))
 
 
 def _with_angles(scene: Scene, angle: Floats) -> clra.ConeBeamGeometry:
-    return replace(scene.believed, angle=angle).geometry()
+    return replace(scene.assumed, angle=angle).geometry()
 
 
 def rows_reversed(scene: Scene) -> Scene:
@@ -153,7 +153,7 @@ def replace_rows(geometry: clra.ConeBeamGeometry) -> clra.ConeBeamGeometry:
 def transposed(scene: Scene) -> Scene:
     """Store frames with rows and columns exchanged, and report them as they are stored."""
     rows, columns = scene.reported.shape
-    reported = replace(scene.believed, shape=(columns, rows)).geometry()
+    reported = replace(scene.assumed, shape=(columns, rows)).geometry()
     # The pixel keeps its size.
     scale = rows / columns
     reported = clra.ConeBeamGeometry(

@@ -131,7 +131,7 @@ class Kind:
             parallel=self.parallel,
         )
 
-    def believed(self, size: int) -> Stage:
+    def assumed(self, size: int) -> Stage:
         """Return what the operator reports."""
         calm = replace(self, angle_error=0.0)
         return calm.stage(size, np.random.default_rng(0)).still()
@@ -145,16 +145,16 @@ class Kind:
         height = shape_height(stage, self.tall)
         body = phantom(self.sample, 0.5 * width, height, seed)
         points = cylinder_points(0.5 * min(width, 1.0), height)
-        believed = self.believed(size)
+        assumed = self.assumed(size)
         integrals = radiographs(stage, body).astype(np.float64)
-        reported, actual = believed.geometry(), stage.geometry()
+        reported, actual = assumed.geometry(), stage.geometry()
         made: dict[str, Any] = {"pixels": integrals, "kind": "line-integrals"}
         if self.photons:
             # A dark pixel counts as half a photon.
             pixels = np.maximum(counted(integrals, self.photons, seed), 0.5 / self.photons)
             made = {"pixels": -np.log(pixels), "kind": "line-integrals"}
         scene = stress_defects.Scene(
-            made["pixels"], made["kind"], reported, actual, seed, self.strength, believed
+            made["pixels"], made["kind"], reported, actual, seed, self.strength, assumed
         )
         if self.defect:
             scene = getattr(stress_defects, self.defect)(scene)
@@ -235,7 +235,7 @@ def _kinds() -> dict[str, Kind]:
     for name, defect, strength, cause in _DEFECTS:
         kinds[name] = replace(circle, defect=defect, strength=strength, causes=cause)
     kinds["wrong-rows"] = replace(helix, defect="rows_reversed", causes=("row-order",))
-    kinds["wrong-turn-helix"] = replace(helix, defect="turned_back", causes=("rotation-sense",))
+    kinds["wrong-turn-helix"] = replace(helix, defect="opposite_sense", causes=("rotation-sense",))
     kinds["axis-offset"] = replace(circle, offset=6.0)
     kinds["axis-offset-half"] = replace(circle, arc=180.0, offset=6.0, causes=("axis-offset",))
     return kinds
@@ -250,7 +250,7 @@ _DEFECTS: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
     ("clipped", "clipped", 0.4, ("clipped-detector",)),
     ("saturated", "saturated", 0.7, ("clipped-detector",)),
     ("half-fan", "half_fan", 0.0, ("half-fan", "truncation")),
-    ("wrong-turn", "turned_back", 0.0, ("rotation-sense",)),
+    ("wrong-turn", "opposite_sense", 0.0, ("rotation-sense",)),
     ("transposed", "transposed", 0.0, ("transposed",)),
     ("doubled-angles", "angles_scaled", 2.0, ("angle-scale",)),
     ("halved-angles", "angles_scaled", 0.5, ("angle-scale",)),

@@ -90,7 +90,7 @@ class Stage:
         return _FIELD / self.shape[1]
 
     def still(self) -> Stage:
-        """Return the stage as the operator believes it to be: nothing moves by mistake."""
+        """Return the stage as the operator assumes it to be: nothing moves by mistake."""
         calm = Stage.of(self.shape, self.angle, self.height)
         return replace(calm, parallel=self.parallel)
 

@@ -1,5 +1,6 @@
 """Option values that are more than a number or a name."""
 
+import math
 import re
 from pathlib import Path
 
@@ -49,6 +50,30 @@ def interval(option: str, text: str) -> tuple[float, float]:
     if not low <= high:
         raise InputError(f"{option}: found {text!r}, expected LOW,HIGH such as -10,8")
     return low, high
+
+
+def axis_place(option: str, text: str) -> tuple[float, ...]:
+    """Read "COLUMN" or "COLUMN,ROW" [pixel].
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        For example "-3.5" or "-3.5,12".
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (1, 2) or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option}: found {text!r}, expected COLUMN or COLUMN,ROW such as -3.5,12")
+    return numbers
 
 
 def pixel(text: str) -> float | tuple[float, float]:

@@ -18,11 +18,14 @@ import typer
 from clra.app import progress_bar
 
 if TYPE_CHECKING:
+    from clra.io.scanners.scanner_scan import ScannerScan
     from clra.model.scan import Scan
     from clra.progress import ProgressCallback
 
 
-ScanPath = Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")]
+ScanPath = Annotated[
+    Path, typer.Argument(metavar="SCAN", help="NXtomo file, or a scanner's metadata or folder.")
+]
 
 
 @dataclass(frozen=True)
@@ -108,11 +111,28 @@ class Reading:
         str | None, typer.Option(metavar="NAME", help="Which scan, if the file holds several.")
     ] = None
     rotation: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="ccw|cw", help="How the sample turns as its angle grows, seen from above."
+            metavar="ccw|cw",
+            help="How the sample turns as its angle grows, seen from above; by default ccw, or as "
+            "the scanner's metadata have it.",
         ),
-    ] = "ccw"
+    ] = None
+    flip: Annotated[
+        str | None,
+        typer.Option(
+            metavar="columns|rows|both",
+            help="The radiographs are stored mirrored against what the file says.",
+        ),
+    ] = None
+    centre_offset: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLUMN[,ROW]",
+            help="Where the axis is seen, and the source's perpendicular, in pixels from the "
+            "detector's middle, in place of the file's.",
+        ),
+    ] = None
     source_distance: Annotated[
         float | None,
         typer.Option(metavar="MM", help="Source to rotation axis, in place of the file's."),
@@ -124,6 +144,27 @@ class Reading:
         float | None,
         typer.Option(metavar="COUNTS", help="Counts of the open beam, in place of flat frames."),
     ] = None
+
+    def scanner(self, path: Path) -> "ScannerScan | None":
+        """Read the metadata of a scanner; None of an NXtomo file."""
+        from clra.io.scanners.recognise import read_scanner
+        from clra.io.scanners.scanner_options import ScannerOptions
+
+        options = ScannerOptions(
+            rotation=self.rotation,
+            source_distance=self.source_distance,
+            parallel=self.parallel,
+            white=self.white,
+            flip=self.flip,
+            centre_offset=self._axis(),
+        )
+        return read_scanner(path, options)
+
+    def _axis(self) -> tuple[float, ...] | None:
+        from clra.app.arguments import axis_place
+
+        text = self.centre_offset
+        return None if text is None else axis_place("--centre-offset", text)
 
     def scan(self, path: Path) -> "Scan":
         """Open a scan; its radiographs are read when they are needed."""
@@ -137,6 +178,8 @@ class Reading:
             source_distance=self.source_distance,
             parallel=self.parallel,
             white=self.white,
+            flip=self.flip,
+            centre_offset=self._axis(),
         )
         warn_of_scale(scan)
         return scan

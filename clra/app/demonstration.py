@@ -5,13 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clra.app.records import Record
+from clra.app.annotations import annotated
 from clra.app.report.html_report import write_report
 from clra.app.report.summary import Errors, findings_of, summary_of
 from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
+from clra.io.alignment_file import write_alignment
 from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import write_volume
 from clra.methods.alignment.align import align
+from clra.methods.alignment.result import AlignmentResult
 from clra.methods.reconstruction.reconstruct import reconstruct
 from clra.model.grid import default_grid
 
@@ -31,25 +33,25 @@ class Shown:
     ----------
     folder : Path
         Holds scan.nxs, motion.h5, before.h5, after.h5 and report.html.
-    record : Record
+    result : AlignmentResult
         Of the alignment.
     errors : Errors
         Against the motion that was put in.
     """
 
     folder: Path
-    record: Record
+    result: AlignmentResult
     errors: Errors
 
     def values(self) -> dict[str, Any]:
         """Results for programs."""
-        values, _ = summary_of(self.record, self.errors)
+        values, _ = summary_of(self.result, self.errors)
         files = {name: self.folder / name for name in ("scan.nxs", "motion.h5", "report.html")}
         return {"folder": self.folder, "files": files, **values}
 
     def text(self) -> str:
         """Results for people."""
-        _, text = summary_of(self.record, self.errors)
+        _, text = summary_of(self.result, self.errors)
         return (
             f"{text}\n\nscan.nxs, motion.h5, before.h5 and after.h5 are in {self.folder}\n"
             f"report: {self.folder / 'report.html'}"
@@ -102,14 +104,13 @@ def run_demo(
     scan = read_scan(folder / "scan.nxs")
     result = align(scan, schedule=schedule, device=device, progress=progress)
     command = f"clra align scan.nxs -o motion.h5 --schedule {schedule} --report report.html"
-    about = {"estimate": "shift+scale", "unobservable": "taken out", "command": command}
-    record = Record.of(result, scan, **about)
-    record.save(folder / "motion.h5")
+    result = annotated(result, scan, command=command)
+    write_alignment(folder / "motion.h5", result)
     grid = default_grid(scan.geometry)
-    for name, motion in (("before.h5", None), ("after.h5", record.motion)):
+    for name, motion in (("before.h5", None), ("after.h5", result.motion)):
         volume = reconstruct(scan, grid=grid, motion=motion, device=device, progress=progress)
         write_volume(folder / name, volume, grid)
-    findings = findings_of(record, scan, device=device, progress=progress)
+    findings = findings_of(result, scan, device=device, progress=progress)
     write_report(folder / "report.html", findings)
     assert findings.errors is not None  # a simulated scan knows its motion
-    return Shown(folder, record, findings.errors)
+    return Shown(folder, result, findings.errors)

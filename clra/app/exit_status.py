@@ -12,12 +12,15 @@ from typing import Any
 
 from typer.core import TyperGroup
 
+from clra.errors import InputError
+
 OK = 0
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 
 _DEBUG = "--debug"
+_BUG = "this is a bug in clra, please report it with all that is printed here"
 
 
 class InterruptedCommandError(Exception):
@@ -79,9 +82,9 @@ def _verdict(error: BaseException) -> tuple[int, str]:
         )
     if _is_opencl(error, "Error") and not _is_opencl(error, "LogicError"):
         return FAILED, f"the OpenCL device failed: {error}: try another with --device"
-    if isinstance(error, (ValueError, NotImplementedError)):
-        return BAD_INPUT, str(error) or kind
-    return FAILED, f"clra failed, please report it ({_DEBUG} shows where): {kind}: {error}"
+    if isinstance(error, InputError):
+        return BAD_INPUT, str(error)
+    return FAILED, f"{_BUG}: {kind}: {error}"
 
 
 def _of_system(error: OSError) -> tuple[int, str]:
@@ -166,9 +169,9 @@ class Group(TyperGroup):
                     **extra,
                 )
         except Exception as error:
-            if debug:
-                traceback.print_exc()
             status, line = verdict(error)
+            if debug or line.startswith(_BUG):
+                traceback.print_exc()
             kind = "" if status == INTERRUPTED else "error: "
             print(f"{kind}{line}{_as_found(error, given)}", file=sys.stderr)
         sys.exit(status or OK)

@@ -4,21 +4,15 @@ import errno
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from clra.app.records import Record
 from clra.errors import InputError, OutputError
+from clra.findings import Finding
+from clra.io.alignment_file import read_alignment
 from clra.io.atomic import ensure_writable
-from clra.io.motion_file import read_motion_file
-from clra.io.scan_files import scan_checksum
 from clra.methods.alignment.autofocus import Focus
-from clra.methods.alignment.rejected_views import all_but
-from clra.model.motion import Motion
+from clra.methods.alignment.result import AlignmentResult
 from clra.model.scan import Scan
 
 
@@ -50,10 +44,10 @@ def room_for(
         raise OutputError.writing(path, errno.ENOSPC, found)
 
 
-def motion_for(
+def alignment_for(
     scan: Scan, path: str | os.PathLike[str], geometry: str
-) -> tuple[Scan, Motion, NDArray[np.bool_]]:
-    """Read the motion of a scan, and take the detector as the alignment took it.
+) -> tuple[Scan, AlignmentResult]:
+    """Read the alignment of a scan, and take the detector as the alignment took it.
 
     Parameters
     ----------
@@ -68,33 +62,44 @@ def motion_for(
     -------
     scan : Scan
         With the detector moved and turned as an auto-focus found it, if there was one.
-    motion : Motion
+    alignment : AlignmentResult
         Relative to that.
-    valid_views : ndarray of bool, (views,)
-        Views that the alignment did not flag.
 
     Raises
     ------
     InputError
-        If it is of another number of views, or all of them were flagged. That it was estimated from
-        other radiographs is only worth a warning: two channels of a scan share a motion.
+        If it is of another number of views, or all of them were rejected. That it was estimated
+        from other radiographs is only worth a warning: two channels of a scan share a motion.
     """
-    file = read_motion_file(path)
-    _check(scan, file.motion, file.attributes, path, geometry)
-    valid_views = all_but(file.flagged, scan.views)
-    if not valid_views.any():
+    alignment = read_alignment(path)
+    scan = matched(scan, alignment, path, geometry)
+    if not alignment.valid_views.any():
         found = f"all {scan.views} views"
         raise InputError.at(path, "/motion/flagged", found, "at least one that is not flagged")
-    return focused(scan, file.attributes, path), file.motion, valid_views
+    return scan, alignment
 
 
-def matched(scan: Scan, record: Record, path: str | os.PathLike[str], geometry: str) -> Scan:
+def matched(
+    scan: Scan, alignment: AlignmentResult, path: str | os.PathLike[str], geometry: str
+) -> Scan:
     """Check that an alignment and a scan belong together, and return the scan as aligned.
 
-    As :func:`motion_for` does.
+    As :func:`alignment_for` does.
     """
-    _check(scan, record.motion, record.about, path, geometry)
-    return focused(scan, record.about, path)
+    if alignment.motion.views != scan.views:
+        found = f"{alignment.motion.views} views"
+        raise InputError.at(path, "/motion", found, f"{scan.views} as in {scan.name}")
+    if alignment.checksum and alignment.checksum != scan.checksum():
+        message = f"{os.fspath(path)} was estimated from other radiographs than those of"
+        Finding("scan", f"{message} {scan.name}").warn()
+    told = alignment.about.get("geometry") or geometry
+    if told != geometry:
+        Finding(
+            "geometry",
+            f"{os.fspath(path)} was estimated with {told}, and now {scan.name} is read with "
+            f"{geometry}: the motion fits one of them only",
+        ).warn()
+    return focused(scan, alignment.about, path)
 
 
 def focus_attributes(focus: Focus) -> dict[str, str]:
@@ -117,28 +122,3 @@ def focused(scan: Scan, attributes: Mapping[str, str], path: str | os.PathLike[s
         found = ", ".join(repr(attributes.get(name)) for name in names)
         raise InputError.at(path, "/@detector", found, "a number in each of them") from None
     return Focus(offset, math.radians(tilt), sharpening).applied(scan)
-
-
-def _check(
-    scan: Scan,
-    motion: Motion,
-    attributes: Mapping[str, str],
-    path: str | os.PathLike[str],
-    geometry: str,
-) -> None:
-    if motion.views != scan.views:
-        raise InputError.at(
-            path, "/motion", f"{motion.views} views", f"{scan.views} as in {scan.name}"
-        )
-    if attributes.get("checksum") and attributes["checksum"] != scan_checksum(scan):
-        warnings.warn(
-            f"{os.fspath(path)} was estimated from other radiographs than those of {scan.name}",
-            stacklevel=3,
-        )
-    told = attributes.get("geometry") or geometry
-    if told != geometry:
-        warnings.warn(
-            f"{os.fspath(path)} was estimated with {told}, and now {scan.name} is read with "
-            f"{geometry}: the motion fits one of them only",
-            stacklevel=3,
-        )

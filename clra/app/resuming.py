@@ -4,19 +4,18 @@ import hashlib
 import json
 import os
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.app.records import history_of
 from clra.errors import InputError, OutputError
-from clra.io.motion_file import read_motion_file, write_motion_file
-from clra.io.scan_files import scan_checksum
+from clra.io.alignment_file import read_alignment, write_alignment
 from clra.io.volumes.volume_files import open_volume, read_volume
 from clra.methods.alignment.reprojection import with_margin
+from clra.methods.alignment.result import AlignmentResult
 from clra.methods.reconstruction.imgr_state import ImgrState, ImgrStep
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
@@ -70,19 +69,18 @@ class SavedState:
         with open_volume(self.folder / "volume.h5", state.volume.grid) as target:
             state.volume.write(target)
         # Last, so that it stands for the whole.
-        write_motion_file(
-            self.folder / "motion.h5",
-            state.motion,
-            confidence=np.where(state.rejected, 0.0, 1.0),
+        kept = replace(
+            AlignmentResult.from_motion(state.motion, ~state.rejected),
             history=state.history,
             scan=self._scan.name,
-            checksum=scan_checksum(self._scan),
-            attributes={
+            checksum=self._scan.checksum(),
+            about={
                 "settings": self._settings,
                 "steps": json.dumps([asdict(step) for step in state.steps]),
                 "ended": "yes" if state.ended else "no",
             },
         )
+        write_alignment(self.folder / "motion.h5", kept)
 
     def load(self, stream: Stream, grid: VolumeGrid) -> ImgrState:
         """Take up what the finished levels gave.
@@ -102,25 +100,24 @@ class SavedState:
         path = self.folder / "motion.h5"
         if not path.is_file():
             raise InputError(f"{path}: not found, expected what an interrupted run leaves there")
-        file = read_motion_file(path)
-        if file.attributes.get("checksum") != scan_checksum(self._scan):
+        file = read_alignment(path)
+        if file.checksum != self._scan.checksum():
             raise InputError.at(path, "/@checksum", "another scan", self._scan.name)
-        if file.attributes.get("settings") != self._settings:
-            found = file.attributes.get("settings", "none")
+        if file.about.get("settings") != self._settings:
+            found = file.about.get("settings", "none")
             raise InputError.at(path, "/@settings", found, self._settings)
-        steps = tuple(ImgrStep(**step) for step in json.loads(file.attributes["steps"]))
+        steps = tuple(ImgrStep(**step) for step in json.loads(file.about["steps"]))
         level = level_factor(steps[-1].level)
         wide = with_margin(grid)
         wide = wide.binned(level) if level > 1 else wide
         volume = volume_from(stream, wide, _Planes(self.folder / "volume.h5", wide))
-        assert file.confidence is not None
         return ImgrState(
             volume,
             file.motion,
-            file.confidence == 0,
+            ~file.valid_views,
             steps,
-            history_of(file),
-            file.attributes.get("ended") == "yes",
+            file.history,
+            file.about.get("ended") == "yes",
         )
 
     def clear(self) -> None:

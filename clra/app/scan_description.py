@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.io.scanners.scanner_scan import ScannerScan
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import default_grid
 from clra.model.scan import Scan
@@ -240,6 +241,12 @@ def listed(numbers: Sequence[int], most: int) -> str:
     """List numbers, up to so many: "3, 17 and 2 more"."""
     more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
     return f"{', '.join(map(str, numbers[:most]))}{more}"
+
+
+def scanner_text(scan: ScannerScan) -> str:
+    """Describe what a scanner's files hold: a table, and a line for each finding."""
+    found = [f"note: {finding}" for finding in scan.findings]
+    return "\n".join([table(scan.contents()), *found])
 
 
 def table(lines: dict[str, str]) -> str:

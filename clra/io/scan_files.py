@@ -2,47 +2,56 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.io.atomic import ensure_writable
 from clra.io.nxtomo.fields import Overrides
 from clra.io.nxtomo.reader import read_nxtomo
 from clra.io.nxtomo.writer import write_nxtomo
+from clra.io.scanners.recognise import read_scanner
+from clra.io.scanners.scanner_options import ScannerOptions
+from clra.io.scanners.scanner_scan import ScannerScan
+from clra.model.detector_pose import with_axis_at
+from clra.model.image_flip import flipped
 from clra.model.scan import Scan
 from clra.progress import ProgressCallback
-
-_FRAMES = (".tif", ".tiff", ".raw", ".bin")
-_VENDORS = (".txrm", ".xrm", ".vgi", ".xtekct", ".log")
 
 
 def read_scan(
     path: str | os.PathLike[str],
     *,
     entry: str | None = None,
-    rotation: str = "ccw",
+    rotation: str | None = None,
     source_distance: float | None = None,
     parallel: bool = False,
     white: float | None = None,
+    flip: str | None = None,
+    centre_offset: float | tuple[float, ...] | None = None,
+    options: ScannerOptions | None = None,
 ) -> Scan:
     """Read a scan; the radiographs stay in the file until they are asked for.
 
-    NXtomo files (HDF5) are read. Counts become transmission by the file's flat and dark frames;
-    row 0 is the top of a radiograph; ``x_translation`` moves the sample along increasing columns,
-    ``y_translation`` along the beam, ``z_translation`` up.
+    NXtomo files (HDF5) are read, and what scanners write: Nikon, Zeiss, SkyScan, GE phoenix,
+    FleX-ray and TESCAN, HeliScan, CTSimU, Data Exchange, by their metadata file or folder. Counts
+    become transmission by flat and dark frames; row 0 is the top of a radiograph;
+    ``x_translation`` moves the sample along increasing columns, ``y_translation`` along the beam,
+    ``z_translation`` up.
 
     Parameters
     ----------
     path : path-like
-        The file.
+        The file, or a scanner's folder.
     entry : str, optional
         Which of several scans in the file.
-    rotation : {"ccw", "cw"}
-        How the sample turns as ``rotation_angle`` grows, seen from above (+z).
+    rotation : {"ccw", "cw"}, optional
+        How the sample turns as ``rotation_angle`` grows, seen from above (+z); "ccw" for NXtomo and
+        the vendor's own sense for scanners if not given.
     source_distance : float, optional
         From the source to the rotation axis [mm], in place of the file's.
     parallel : bool
@@ -50,6 +59,14 @@ def read_scan(
         width of where parallel ones would, and the detector at the axis.
     white : float, optional
         Counts of the open beam, in place of flat frames; 1 for radiographs that hold transmission.
+    flip : {"columns", "rows", "both"}, optional
+        The radiographs are stored mirrored against what the file says.
+    centre_offset : float or (float, float), optional
+        Column at which the axis is seen and, if two, row at which the perpendicular from the source
+        meets the detector, from its middle, toward higher columns and rows [pixel].
+    options : ScannerOptions, optional
+        What else a scanner's files leave open: tables of angles and heights, detector distance,
+        pixel size. The arguments above come before its own.
 
     Returns
     -------
@@ -61,19 +78,71 @@ def read_scan(
     InputError
         A ValueError whose one line names the file, the field, what was found and what was expected.
     """
-    place = Path(path)
-    if place.is_dir():
-        raise InputError(f"{place}: found a folder, expected an NXtomo file; clra import makes one")
-    suffix = place.suffix.lower()
-    if place.exists() and suffix in _FRAMES:
-        raise InputError(f"{place}: found frames, expected an NXtomo file; clra import makes one")
-    if place.exists() and suffix in _VENDORS:
-        raise InputError(
-            f"{place}: found a vendor's format, expected an NXtomo file; export the radiographs as "
-            "TIFF and make one with clra import"
-        )
-    overrides = Overrides(rotation, source_distance, parallel)
-    return read_nxtomo(path, entry=entry, overrides=overrides, white=white)
+    given: dict[str, Any] = {
+        "rotation": rotation,
+        "source_distance": source_distance,
+        "parallel": parallel or None,
+        "white": white,
+        "flip": flip,
+        "centre_offset": centre_offset,
+    }
+    said = {name: value for name, value in given.items() if value is not None}
+    scanner = read_scanner(path, replace(options or ScannerOptions(), **said))
+    if scanner is not None:
+        return scanner.scan(white)
+    overrides = Overrides(rotation or "ccw", source_distance, parallel)
+    scan = read_nxtomo(path, entry=entry, overrides=overrides, white=white)
+    geometry = scan.geometry if flip is None else flipped(scan.geometry, flip)
+    if centre_offset is not None:
+        column, *row = np.atleast_1d(centre_offset).tolist()
+        geometry = with_axis_at(geometry, column, row[0] if row else None)
+    return scan if geometry is scan.geometry else replace(scan, geometry=geometry)
+
+
+def import_scanner(
+    out: str | os.PathLike[str],
+    scan: ScannerScan,
+    *,
+    name: str | None = None,
+    progress: ProgressCallback | None = None,
+) -> None:
+    """Write what a scanner's files hold as NXtomo; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    out : path-like
+        The file.
+    scan : ScannerScan
+        Read some frames at a time.
+    name : str, optional
+        Title of the scan; the name of `out` if not given.
+    progress : callable, optional
+        Called with a ``Progress`` as frames are written.
+
+    Raises
+    ------
+    InputError
+        If there are no radiographs beside the metadata.
+    OutputError
+        If the file cannot be written.
+    """
+    ensure_writable(out, keep=(scan.path,))
+    if scan.missing:
+        raise InputError(scan.frames.reason)
+    radiographs = scan.radiographs()
+    others = {"flats": scan.flats, "flats_after": scan.flats_after, "darks": scan.darks}
+    parts = [radiographs, *(part for part in others.values() if part is not None)]
+    write_nxtomo(
+        out,
+        radiographs,
+        scan.geometry,
+        kind=scan.kind,
+        dtype=np.result_type(*(part.dtype for part in parts)),
+        name=name or os.path.basename(os.fspath(out)),
+        truth=scan.known_motion,
+        progress=progress,
+        **others,
+    )
 
 
 def write_scan(
@@ -116,24 +185,6 @@ def write_scan(
         valid_views=valid_views,
         progress=progress,
     )
-
-
-def scan_checksum(scan: Scan) -> str:
-    """Return a checksum by which a motion file can be matched to its scan.
-
-    SHA-256 over the shape and three radiographs (first, middle, last): a whole scan of many GB
-    would take longer to read than to align.
-
-    Parameters
-    ----------
-    scan : Scan
-        Any.
-    """
-    digest = hashlib.sha256(repr(scan.shape).encode())
-    for view in sorted({0, scan.views // 2, scan.views - 1}):
-        pixels = np.ascontiguousarray(scan.projections[view : view + 1], dtype="<f4")
-        digest.update(pixels.tobytes())
-    return f"sha256:{digest.hexdigest()}"
 
 
 class _LineIntegrals:

@@ -1,12 +1,13 @@
 """Radiographs as they would have been without motion, for export and for ideal-row methods."""
 
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.findings import Finding
+from clra.methods.alignment.result import AlignmentResult
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.images.warp import Warp
@@ -15,7 +16,7 @@ from clra.ops.streaming.stream import Stream
 
 def correct(
     scan: Scan,
-    motion: Motion,
+    motion: AlignmentResult | Motion,
     device: Any = None,
     *,
     max_device_memory: int | None = None,
@@ -30,8 +31,9 @@ def correct(
     ----------
     scan : Scan
         As measured.
-    motion : Motion
-        Of its views, as :func:`clra.align` found it.
+    motion : AlignmentResult or Motion
+        Of its views, as :func:`clra.align` found it. Views that an alignment rejected are left out;
+        of a motion alone, no view is.
     device : str or cl.Device, optional
         As :func:`clra.ops.runtime.devices.choose_device` takes it.
     max_device_memory, max_host_memory : int, optional
@@ -48,6 +50,9 @@ def correct(
         If the motion is of another number of views.
     """
     stream = Stream(device, max_device_memory=max_device_memory, max_host_memory=max_host_memory)
+    if isinstance(motion, AlignmentResult):
+        whole = corrected(stream, scan, motion.motion)
+        return whole if motion.valid_views.all() else whole.subset(motion.valid_views)
     return corrected(stream, scan, motion)
 
 
@@ -56,12 +61,12 @@ def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
     if motion.views != scan.views:
         raise InputError(f"motion: found {motion.views} views, expected {scan.views}")
     if motion.cause == "source":
-        warnings.warn(
+        Finding(
+            "parallax",
             "radiographs are resampled as if their detector had moved, but it was the source: they "
             "are right for what lies at the depth of the axis, and what is nearer to the source or "
             "farther keeps its parallax",
-            stacklevel=2,
-        )
+        ).warn()
     return Scan(
         _Corrected(scan, motion, stream),
         scan.geometry,

@@ -43,6 +43,41 @@ def with_detector(
     )
 
 
+def with_axis_at(
+    geometry: ConeBeamGeometry, column: float, row: float | None = None
+) -> ConeBeamGeometry:
+    """Return the geometry with the rotation axis, and the principal row, seen elsewhere.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        As it was thought to be.
+    column : float
+        Where the axis is seen, from the detector's middle, positive toward higher columns; the
+        median over the views [pixel]. Source and detector move beside the axis together.
+    row : float, optional
+        Where the perpendicular from the source meets the detector, likewise, positive toward
+        higher rows [pixel]; as it is if not given.
+    """
+    level = geometry.source * np.array([0.0, 0.0, 1.0])
+    ray = level - geometry.source
+    basis = np.stack([geometry.u, geometry.v, -ray], axis=2)
+    seen = np.linalg.solve(basis, (geometry.source - geometry.detector)[:, :, None])[:, 0, 0]
+    beside = (column - np.median(seen)) * geometry.u
+    beside *= (geometry.source_to_axis / geometry.source_to_detector)[:, None]
+    detector = geometry.detector - beside
+    if row is not None:
+        middle = (geometry.rows - 1) / 2
+        detector = detector - (row - np.median(geometry.principal[:, 1] - middle)) * geometry.v
+    return ConeBeamGeometry(
+        source=geometry.source - beside,
+        detector=detector,
+        u=geometry.u,
+        v=geometry.v,
+        shape=geometry.shape,
+    )
+
+
 def steep_rows(geometry: ConeBeamGeometry) -> str:
     """Return a warning if detector rows are too steep to be filtered along.
 

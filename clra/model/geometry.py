@@ -44,8 +44,8 @@ class ConeBeamGeometry:
     Raises
     ------
     InputError
-        If shapes disagree, a number is not finite, ``u`` and ``v`` are parallel, or the source
-        lies in the detector's plane.
+        If shapes disagree, a number is not finite, ``u`` and ``v`` are parallel, or the source is
+        in the detector's plane.
     """
 
     source: Floats
@@ -109,14 +109,20 @@ class ConeBeamGeometry:
         return self.shape == other.shape and np.array_equal(self.to_astra(), other.to_astra())
 
     def __repr__(self) -> str:
-        """Summarise views, detector, distances and travel."""
+        """Summarise views, detector, distances, travel, sense of rotation and order of rows."""
         z = self.source[:, 2]
+        angle = np.arctan2(self.u[:, 1], self.u[:, 0])
+        # Steps of more than half a turn count as shorter ones the other way.
+        step = np.sum(np.sign((np.diff(angle) + np.pi) % (2 * np.pi) - np.pi))
+        turns = "turns cw" if step > 0 else "turns ccw" if step < 0 else "stands"
+        row0 = "bottom" if np.median(self.v[:, 2]) >= 0 else "top"
         pixel = f"{np.median(_norm(self.u)):.4g} x {np.median(_norm(self.v)):.4g}"
         return (
             f"ConeBeamGeometry({self.views} views of {self.rows} x {self.columns} pixels, "
             f"pixel {pixel} mm, source to axis {np.median(self.source_to_axis):.4g} mm, "
             f"to detector {np.median(self.source_to_detector):.4g} mm, "
-            f"source z {z.min():.4g} to {z.max():.4g} mm)"
+            f"source z {z.min():.4g} to {z.max():.4g} mm, sample {turns}, "
+            f"row 0 at the {row0})"
         )
 
     @property
@@ -150,7 +156,6 @@ class ConeBeamGeometry:
 
     @property
     def _centre(self) -> Floats:
-        """(column, row) of the detector's centre."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
     def with_motion(self, motion: Motion | RigidMotion) -> ConeBeamGeometry:
@@ -163,18 +168,18 @@ class ConeBeamGeometry:
         Parameters
         ----------
         motion : Motion or RigidMotion
-            Shifts in pixels of this geometry's detector: absorb first, bin after.
+            In pixels of this geometry's detector: absorb first, bin after.
 
         Returns
         -------
         ConeBeamGeometry
-            With u / m, v / m and detector - (shift_u u + shift_v v) / m; for a motion of the source
-            moved by `source_displacement`; for a rigid one with all four vectors moved back.
+            With u / m, v / m and detector - (shift_u u + shift_v v) / m; or with the source, or all
+            four vectors, moved.
 
         Raises
         ------
         InputError
-            If the motion is of another number of views.
+            If it is of another number of views.
         """
         if isinstance(motion, RigidMotion):
             return ConeBeamGeometry(**absorb(self, motion), shape=self.shape)
@@ -201,10 +206,9 @@ class ConeBeamGeometry:
         Returns
         -------
         ndarray, (views, 3)
-            Displacement (x, y, z) of the source, the detector standing still [mm]: along the
-            detector ``-shift pitch / (M' - 1)`` with the shift that is left when the magnification
-            is taken about the principal point, and toward it until SDD / SOD has become M' = m SDD
-            / SOD.
+            Displacement (x, y, z) of the source [mm]: along the detector ``-shift pitch / (M' -
+            1)``, the magnification taken about the principal point, and toward it until SDD / SOD
+            has become M' = m SDD / SOD.
         """
         to_axis, to_detector = self.source_to_axis, self.source_to_detector
         magnified = motion.magnification * to_detector / to_axis
@@ -235,10 +239,8 @@ class ConeBeamGeometry:
         factor = whole("factor", factor)
         rows, columns = self.rows // factor, self.columns // factor
         if not rows or not columns:
-            raise InputError(
-                f"factor: found {factor}, expected at most {min(self.shape)} to bin "
-                f"{self.rows} x {self.columns} pixels"
-            )
+            most = f"{min(self.shape)} to bin {self.rows} x {self.columns} pixels"
+            raise InputError(f"factor: found {factor}, expected at most {most}")
         lost_u, lost_v = self.columns - columns * factor, self.rows - rows * factor
         return ConeBeamGeometry(
             source=self.source,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -186,43 +185,6 @@ class Motion:
             magnification=self.magnification[chosen],
             cause=self.cause,
         )
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a motion file (HDF5, `/motion`); it appears whole or not at all.
-
-        Parameters
-        ----------
-        path : path-like
-            The file, by custom ``MOTION.h5``.
-
-        Raises
-        ------
-        OutputError
-            If it cannot be written.
-        """
-        # The one import from a floor above: a value does not know its file format, but the public
-        # face wants it to be saved by a method.
-        from clra.io.motion_file import write_motion_file
-
-        write_motion_file(path, self)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Motion:
-        """Read the motion from a motion file.
-
-        Parameters
-        ----------
-        path : path-like
-            As `save` or ``clra align`` wrote it.
-
-        Raises
-        ------
-        InputError
-            If it is no motion file.
-        """
-        from clra.io.motion_file import read_motion_file
-
-        return read_motion_file(path).motion
 
     def _table(self) -> Floats:
         """All three, (3, views)."""

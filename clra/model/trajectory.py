@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -29,8 +30,12 @@ PAPER: Mapping[str, Any] = MappingProxyType(
 ``helix(3456, angle_step=math.radians(0.5), **PAPER)``. The detector's shape is not in the paper;
 this one sees the phantom's whole width."""
 
+ROTATIONS, ROWS = ("cw", "ccw"), ("bottom", "top")
+
 # The angle of the paper's space-filling trajectory, "about 15.3 degrees".
 _NEAR = math.radians(15.3)
+# A circle of more turns than this, or a step of more than one, is one in degrees.
+_TURNS = 4
 
 
 def circular(
@@ -42,11 +47,15 @@ def circular(
     shape: tuple[int, int],
     start: float = 0.0,
     arc: float = 2 * math.pi,
+    rotation: str = "cw",
+    row0: str = "bottom",
 ) -> ConeBeamGeometry:
     """Return a circle, or an arc of one.
 
-    At angle b the source is at ``source_to_axis (sin b, -cos b, 0)``, u points along
-    (cos b, sin b, 0) and v along +z, as in all trajectories here.
+    With the default words, at angle b the source is at ``source_to_axis (sin b, -cos b, 0)``, u
+    points along (cos b, sin b, 0) and v along +z, as in all trajectories here. For frames that the
+    command line reads with its defaults, and for NXtomo files, it is ``rotation="ccw"`` and
+    ``row0="top"``.
 
     Parameters
     ----------
@@ -60,17 +69,24 @@ def circular(
         Rows and columns of the detector.
     start, arc : float
         First angle and angle covered [rad].
+    rotation : {"cw", "ccw"}
+        How the sample turns as the angle grows, seen from above (from +z): clockwise, so that b is
+        the angle, or counter-clockwise, b = -angle.
+    row0 : {"bottom", "top"}
+        Where row 0 of a radiograph lies: v points along +z or along -z.
 
     Raises
     ------
     InputError
-        If there is no view, a number is not finite, or a distance not positive.
+        If there is no view, a number is not finite, a distance not positive, a word none of its
+        choices, or an angle so large that it must be in degrees.
     """
     views = whole("views", views)
     angles = finite("start", start) + np.arange(views, dtype=np.float64) * (
-        finite("arc", arc) / views
+        _radians("arc", arc, _TURNS) / views
     )
-    return _around(angles, np.zeros(views), source_to_axis, source_to_detector, pixel_size, shape)
+    stage = _Stage(source_to_axis, source_to_detector, pixel_size, shape, rotation, row0)
+    return stage.at(angles, np.zeros(views))
 
 
 def helix(
@@ -83,6 +99,8 @@ def helix(
     pixel_size: float,
     shape: tuple[int, int],
     start: float = 0.0,
+    rotation: str = "cw",
+    row0: str = "bottom",
 ) -> ConeBeamGeometry:
     """Return a helix about the z axis, centred on z = 0.
 
@@ -94,7 +112,7 @@ def helix(
         Angle from one view to the next [rad].
     z_step : float
         Rise from one view to the next; negative downward [mm].
-    source_to_axis, source_to_detector, pixel_size, shape, start
+    source_to_axis, source_to_detector, pixel_size, shape, start, rotation, row0
         As in `circular`.
 
     Raises
@@ -103,12 +121,11 @@ def helix(
         As `circular` does.
     """
     views = whole("views", views)
-    angles = finite("start", start) + np.arange(views, dtype=np.float64) * finite(
+    angles = finite("start", start) + np.arange(views, dtype=np.float64) * _radians(
         "angle_step", angle_step
     )
-    return _around(
-        angles, _heights(views, z_step), source_to_axis, source_to_detector, pixel_size, shape
-    )
+    stage = _Stage(source_to_axis, source_to_detector, pixel_size, shape, rotation, row0)
+    return stage.at(angles, _heights(views, z_step))
 
 
 def double_helix(
@@ -122,6 +139,8 @@ def double_helix(
     shape: tuple[int, int],
     second: str = "half-turn",
     start: float = 0.0,
+    rotation: str = "cw",
+    row0: str = "bottom",
 ) -> ConeBeamGeometry:
     """Return a helix followed by a second one along which the stage travels back.
 
@@ -131,7 +150,7 @@ def double_helix(
         Number of views N of each helix; there are 2 N views.
     angle_step, z_step
         Of the first helix, as in `helix`.
-    source_to_axis, source_to_detector, pixel_size, shape, start
+    source_to_axis, source_to_detector, pixel_size, shape, start, rotation, row0
         As in `circular`.
     second : {"half-turn", "return"}
         "half-turn": the first helix turned by half a turn and followed backwards; view N + k is
@@ -146,7 +165,7 @@ def double_helix(
         As `circular` does, and for another `second`.
     """
     views = whole("views_per_helix", views_per_helix)
-    angles = np.arange(views, dtype=np.float64) * finite("angle_step", angle_step)
+    angles = np.arange(views, dtype=np.float64) * _radians("angle_step", angle_step)
     if second == "half-turn":
         later = angles[::-1] + math.pi
     elif second == "return":
@@ -154,13 +173,9 @@ def double_helix(
     else:
         raise InputError(f"second: found {second!r}, expected 'half-turn' or 'return'")
     z = _heights(views, z_step)
-    return _around(
-        finite("start", start) + np.concatenate([angles, later]),
-        np.concatenate([z, z[::-1]]),
-        source_to_axis,
-        source_to_detector,
-        pixel_size,
-        shape,
+    stage = _Stage(source_to_axis, source_to_detector, pixel_size, shape, rotation, row0)
+    return stage.at(
+        finite("start", start) + np.concatenate([angles, later]), np.concatenate([z, z[::-1]])
     )
 
 
@@ -174,12 +189,14 @@ def space_filling(
     shape: tuple[int, int],
     angle_step: float | None = None,
     start: float = 0.0,
+    rotation: str = "cw",
+    row0: str = "bottom",
 ) -> ConeBeamGeometry:
     """Return a space-filling trajectory: a helix of so large an angle step that it is a lattice.
 
     Parameters
     ----------
-    views, z_step, source_to_axis, source_to_detector, pixel_size, shape, start
+    views, z_step, source_to_axis, source_to_detector, pixel_size, shape, start, rotation, row0
         As in `helix`.
     angle_step : float, optional
         Angle from one view to the next [rad]; if not given, `lattice_angle`.
@@ -200,6 +217,8 @@ def space_filling(
         pixel_size=pixel_size,
         shape=shape,
         start=start,
+        rotation=rotation,
+        row0=row0,
     )
 
 
@@ -264,23 +283,46 @@ def _heights(views: int, z_step: float) -> Floats:
     return (np.arange(views, dtype=np.float64) - (views - 1) / 2) * finite("z_step", z_step)
 
 
-def _around(
-    angles: Floats,
-    z: Floats,
-    source_to_axis: float,
-    source_to_detector: float,
-    pixel_size: float,
-    shape: tuple[int, int],
-) -> ConeBeamGeometry:
-    """Geometry of an ideal stage at each angle and height."""
-    radius = positive("source_to_axis", source_to_axis)
-    beyond = positive("source_to_detector", source_to_detector) - radius
-    pixel = positive("pixel_size", pixel_size)
-    cos, sin, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
-    return ConeBeamGeometry(
-        source=np.stack([radius * sin, -radius * cos, z], axis=1),
-        detector=np.stack([-beyond * sin, beyond * cos, z], axis=1),
-        u=pixel * np.stack([cos, sin, zero], axis=1),
-        v=pixel * np.stack([zero, zero, zero + 1], axis=1),
-        shape=shape,
-    )
+def _radians(name: str, angle: float, turns: float = 1) -> float:
+    """Return an angle [rad], unless it is more than so many turns."""
+    found = finite(name, angle)
+    if abs(found) > 2 * math.pi * turns * (1 + 1e-9):
+        raise InputError(
+            f"{name}: found {found:g}, expected at most {2 * math.pi * turns:.4g} radians; "
+            f"{found:g} degrees are math.radians({found:g})"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """An ideal stage, and how its frames are counted."""
+
+    source_to_axis: float
+    source_to_detector: float
+    pixel_size: float
+    shape: tuple[int, int]
+    rotation: str
+    row0: str
+
+    def at(self, angles: Floats, z: Floats) -> ConeBeamGeometry:
+        """Geometry at each angle and height."""
+        for name, word, words in (
+            ("rotation", self.rotation, ROTATIONS),
+            ("row0", self.row0, ROWS),
+        ):
+            if word not in words:
+                raise InputError(f"{name}: found {word!r}, expected one of {words}")
+        radius = positive("source_to_axis", self.source_to_axis)
+        beyond = positive("source_to_detector", self.source_to_detector) - radius
+        pixel = positive("pixel_size", self.pixel_size)
+        b = angles if self.rotation == "cw" else -angles
+        up = 1.0 if self.row0 == "bottom" else -1.0
+        cos, sin, zero = np.cos(b), np.sin(b), np.zeros_like(b)
+        return ConeBeamGeometry(
+            source=np.stack([radius * sin, -radius * cos, z], axis=1),
+            detector=np.stack([-beyond * sin, beyond * cos, z], axis=1),
+            u=pixel * np.stack([cos, sin, zero], axis=1),
+            v=pixel * np.stack([zero, zero, zero + up], axis=1),
+            shape=self.shape,
+        )

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
+from clra.app.annotations import annotated
 from clra.app.cli import app
-from clra.app.records import Record
 from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
+from clra.findings import Finding
+from clra.io.alignment_file import write_alignment
 from clra.io.scan_files import write_scan
 from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.model.motion import Motion
@@ -46,28 +48,34 @@ def result(scan: Scan) -> AlignmentResult:
             shift_v=truth.shift_v + random.normal(0, 0.1, VIEWS),
             magnification=truth.magnification,
         ),
-        history=[
+        history=(
             Iteration("QR", 1, 1.5, 1.4, 3.9, 0.8, 0.05, 2.0, note="few features\n3 < 4 views"),
             Iteration("HR", 1, 0.2, 0.1, 0.4, 0.9, 0.04, 8.0, 0.1, 0.1, 1e-4, 0.05, 0.05, 1e-4),
-        ],
+        ),
         confidence=confidence,
         sigma=np.tile([0.01, 0.02, 1e-4], (VIEWS, 1)),
         gauge={"translation x": 0.25, "tilt y": 0.125},
-        flagged=FLAGGED,
+        valid_views=confidence > 0,
+        estimate="shift+scale",
+        warnings=(Finding("note", "few features"), Finding("note", "3 < 4 views")),
+        checksum=scan.checksum(),
+        scan=scan.name,
+        versions={"clra": "0.0.1", "driver": "1"},
+        about={"unobservable": "taken out"},
         schedule="1QR-1HR",
         device="a device",
     )
 
 
 @pytest.fixture(scope="session")
-def record(result: AlignmentResult, scan: Scan) -> Record:
-    return Record.of(result, scan, estimate="shift+scale", command="clra align <scan>.nxs")
+def record(result: AlignmentResult, scan: Scan) -> AlignmentResult:
+    return annotated(result, scan, command="clra align <scan>.nxs")
 
 
 @pytest.fixture
-def motion_file(record: Record, tmp_path: Path) -> Path:
+def motion_file(record: AlignmentResult, tmp_path: Path) -> Path:
     path = tmp_path / "motion.h5"
-    record.save(path)
+    write_alignment(path, record)
     return path
 
 

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from alignments import keep_motion
 
 from clra.app import demonstration
-from clra.app.records import Record
 from clra.app.simulation import paper_like, sample
-from clra.io.motion_file import write_motion_file
+from clra.io.alignment_file import read_alignment, write_alignment
 from clra.io.nxtomo.writer import write_nxtomo
 from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import read_volume
@@ -119,14 +119,14 @@ def test_bad_input_is_refused_before_work(clra, scan_file, motion_file, tmp_path
     refused(clra("align", scan_file, "-o", volume, "--estimate", "all"), 2, "all")
     refused(clra("align", scan_file, "-o", tmp_path / "no" / "m.h5"), 1, "make the folder")
     refused(clra("report", scan_file, "-o", tmp_path / "r.html"), 2, scan_file)
-    write_motion_file(tmp_path / "short.h5", Motion.identity(7))
+    keep_motion(tmp_path / "short.h5", Motion.identity(7))
     for arguments in (
         ["reconstruct", scan_file, "-o", volume, "--motion", tmp_path / "short.h5"],
         ["correct", scan_file, "-o", tmp_path / "c.nxs", "--motion", tmp_path / "short.h5"],
         ["report", tmp_path / "short.h5", "-o", tmp_path / "r.html", "--scan", scan_file],
     ):
         refused(clra(*arguments), 2, "short.h5", "7 views", "24")
-    write_motion_file(tmp_path / "none.h5", Motion.identity(24), flagged=range(24))
+    keep_motion(tmp_path / "none.h5", Motion.identity(24), flagged=range(24))
     for command, out in (("reconstruct", volume), ("correct", tmp_path / "c.nxs")):
         found = clra(command, scan_file, "-o", out, "--motion", tmp_path / "none.h5")
         refused(found, 2, "none.h5", "/motion/flagged", "all 24 views")
@@ -254,10 +254,10 @@ def test_alignment_goes_on_from_a_motion(clra, monkeypatch, scan_file, tmp_path)
         "align", scan_file, "-o", last, "--schedule", "1HR", "--start", first, "--json"
     )
     assert code == 0, err
-    begun, ended = Record.load(first), Record.load(last)
+    begun, ended = read_alignment(first), read_alignment(last)
     assert ended.history[:2] == begun.history and len(json.loads(out)["history"]) == 3
     assert ended.about["detector_tilt"] == begun.about["detector_tilt"] == "0.572958 degree"
-    assert ended.about["command"].endswith(f"--start {first}")
+    assert ended.command.endswith(f"--start {first}")
     # It begins where the other ended: were it at no motion, it would move by most of it again.
     moved = np.abs(ended.motion.shift_v - begun.motion.shift_v).mean()
     assert moved < 0.3 * np.abs(begun.motion.shift_v).mean()
@@ -327,7 +327,7 @@ def test_nothing_that_is_read_is_overwritten(clra, scan_file, motion_file, monke
 def test_a_motion_found_with_another_geometry_is_warned_of(clra, record, scan_file, tmp_path):
     path, out = tmp_path / "m.h5", tmp_path / "c.nxs"
     about = {**record.about, "geometry": "--rotation cw"}
-    replace(record, about=about).save(path)
+    write_alignment(path, replace(record, about=about))
     for options in ((), ("--source-distance", 5.0), ("--rotation", "cw")):
         code, _, err = clra("correct", scan_file, "--motion", path, "-o", out, "-q", *options)
         assert code == 0
@@ -360,7 +360,7 @@ def test_radiographs_that_the_flats_are_not_of_are_noticed(clra, counts, told, t
 @pytest.mark.filterwarnings("default")
 def test_the_motion_of_another_scan_is_warned_of(clra, record, scan_file, tmp_path):
     path = tmp_path / "m.h5"
-    write_motion_file(path, record.motion, checksum="sha256:other")
+    keep_motion(path, record.motion, checksum="sha256:other")
     code, _, err = clra("correct", scan_file, "--motion", path, "-o", tmp_path / "c.nxs", "-q")
     assert code == 0
     assert err.startswith("warning: ") and "other radiographs" in err and err.count("\n") == 1

@@ -13,7 +13,9 @@ from clra.ops.streaming.memory import DeviceMemoryError
     ("error", "status", "part"),
     [
         (InputError.at("a.nxs", "angle", 3, 4), 2, "a.nxs: angle: found 3, expected 4"),
-        (ValueError("schedule: found 'x'"), 2, "schedule: found 'x'"),
+        (ValueError("operands could not be broadcast"), 1, "a bug in clra, please report it"),
+        (NotImplementedError(), 1, "a bug in clra"),
+        (TypeError("an integer is required"), 1, "a bug in clra"),
         (FileNotFoundError(errno.ENOENT, "No such file", "a.txt"), 2, "a.txt: No such file"),
         (OutputError.writing("v.h5", errno.ENOSPC, ""), 1, "free some space"),
         (OSError(errno.ENOSPC, "No space left on device", "v.h5"), 1, "free some space"),
@@ -24,7 +26,7 @@ from clra.ops.streaming.memory import DeviceMemoryError
         (MemoryError(), 1, "clra info"),
         (cl.MemoryError("clEnqueue"), 1, "clra info"),
         (cl.RuntimeError("clFinish"), 1, "--device"),
-        (ZeroDivisionError("oops"), 1, "--debug"),
+        (ZeroDivisionError("oops"), 1, "ZeroDivisionError: oops"),
         (InterruptedCommandError(), 130, "nothing was written"),
     ],
 )
@@ -46,3 +48,19 @@ def test_warnings_are_one_line_and_compiler_logs_none(capsys):
         warnings.warn("two\nlines", stacklevel=1)
         warnings.warn("log", cl.CompilerWarning, stacklevel=1)
     assert capsys.readouterr().err == "warning: two lines\n"
+
+
+def test_a_bug_shows_its_traceback_and_bad_input_does_not(clra, monkeypatch, scan_file):
+    def fails(*_: object, **__: object) -> None:
+        raise ValueError("operands could not be broadcast")
+
+    monkeypatch.setattr("clra.io.scan_files.read_scan", fails)
+    code, out, err = clra("info", scan_file)
+    assert (code, out) == (1, "")
+    assert err.startswith("Traceback") and "in fails" in err
+    last = err.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert last.endswith("ValueError: operands could not be broadcast")
+    monkeypatch.undo()
+    code, out, err = clra("info", "none.nxs")
+    assert (code, out, err) == (2, "", "error: none.nxs: no such file\n")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from alignments import keep_motion
 
 from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import read_volume
@@ -54,7 +55,7 @@ def test_align_and_reconstruct_by_one_command(figure, wood, tmp_path, clra):
     """Chain `--align`; then `--motion` with the true one, and no motion, to compare with."""
     path, known = tmp_path / "wood.nxs", tmp_path / "motion.h5"
     write_scan(path, wood)
-    wood.truth.save(known)
+    keep_motion(known, wood.truth)
     grid = default_grid(read_scan(path).geometry)
     truth = figure.core_of(wood.geometry).volume(grid)
     volumes = {}

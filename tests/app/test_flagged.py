@@ -6,9 +6,10 @@ import re
 import h5py
 import numpy as np
 import pytest
+from alignments import keep_motion
 
 from clra.app.simulation import paper_like, sample, simulated_motion
-from clra.io.motion_file import read_motion_file, write_motion_file
+from clra.io.alignment_file import read_alignment
 from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import read_volume
 from clra.model.scan import Scan
@@ -90,7 +91,7 @@ def test_the_unobservable_stays_if_it_is_to(clra, bad_file, tmp_path):
         page = tmp_path / f"{gauge}.html"
         assert clra("report", motion, "-o", page)[0] == 0
         assert f"It was {fate}" in page.read_text(encoding="utf-8")
-        found[gauge] = read_motion_file(motion).motion
+        found[gauge] = read_alignment(motion).motion
     # A translation along z is a constant in v.
     assert abs(found["free"].shift_v.mean()) > 2 * abs(found["anchored"].shift_v.mean())
 
@@ -98,7 +99,7 @@ def test_the_unobservable_stays_if_it_is_to(clra, bad_file, tmp_path):
 @pytest.mark.parametrize("method", ["fbp", "imgr"])
 def test_flagged_views_are_left_out_of_the_volume(clra, measured, tmp_path, method):
     motion = tmp_path / "m.h5"
-    write_motion_file(motion, measured.truth, flagged=[BLANK, SATURATED])
+    keep_motion(motion, measured.truth, flagged=[BLANK, SATURATED])
     volumes = []
     for name, values in (("bad", [0.0, 9.0]), ("worse", [7.0, -5.0])):
         path = tmp_path / f"{name}.nxs"
@@ -115,7 +116,7 @@ def test_flagged_views_are_left_out_of_the_volume(clra, measured, tmp_path, meth
 def test_flagged_views_are_marked_invalid_where_radiographs_are_corrected(clra, measured, tmp_path):
     motion, source, out = tmp_path / "m.h5", tmp_path / "bad.nxs", tmp_path / "c.nxs"
     write_scan(source, spoilt(measured, [0.0, 9.0]))
-    write_motion_file(motion, read_scan(source).truth, flagged=[BLANK, SATURATED])
+    keep_motion(motion, read_scan(source).truth, flagged=[BLANK, SATURATED])
     code, told, err = clra("correct", source, "--motion", motion, "-o", out)
     assert code == 0, err
     assert f"2 views flagged: {BLANK}, {SATURATED}; marked invalid" in told
@@ -140,7 +141,7 @@ def test_flagged_views_are_marked_invalid_where_radiographs_are_corrected(clra, 
 
 def test_nothing_is_marked_where_nothing_was_flagged(clra, measured, bad_file, tmp_path):
     motion, out = tmp_path / "m.h5", tmp_path / "c.nxs"
-    write_motion_file(motion, measured.truth)
+    keep_motion(motion, measured.truth)
     code, told, err = clra("correct", bad_file, "--motion", motion, "-o", out)
     assert code == 0, err
     assert "flagged" not in told

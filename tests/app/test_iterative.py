@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from alignments import keep_motion
 
 from clra.io.scan_files import read_scan
 from clra.io.volumes.volume_files import read_volume, write_volume
@@ -95,8 +96,8 @@ def test_resumed_to_the_bit(clra, scan_file, tmp_path, stopping):
 def test_another_motion_is_not_gone_on_with(clra, scan_file, tmp_path, stopping):
     out, first, second = (tmp_path / name for name in ("volume.h5", "one.h5", "two.h5"))
     scan = read_scan(scan_file)
-    Motion.identity(scan.views).save(first)
-    Motion(shift_u=np.ones(scan.views), shift_v=np.zeros(scan.views)).save(second)
+    keep_motion(first, Motion.identity(scan.views))
+    keep_motion(second, Motion(shift_u=np.ones(scan.views), shift_v=np.zeros(scan.views)))
     options = ("reconstruct", scan_file, "-o", out, "--method", "imgr", "--levels", "HR-FR")
     stopping(1)
     assert clra(*options, "--motion", first)[0] == 130

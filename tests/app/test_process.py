@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -18,7 +17,7 @@ def run(*arguments, **options):
     return done.returncode, done.stdout, done.stderr
 
 
-def test_devices_are_listed_quickly_and_nothing_heavy_is_imported():
+def test_devices_are_listed_and_nothing_heavy_is_imported():
     code = (
         "import sys; from clra.app.cli import app; "
         "import clra.ops.runtime.devices, clra.ops.runtime.build; "
@@ -27,10 +26,8 @@ def test_devices_are_listed_quickly_and_nothing_heavy_is_imported():
     )
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    started = time.perf_counter()
     code, out, err = run("devices")
     assert (code, err) == (0, "") and out
-    assert time.perf_counter() - started < 5  # 0.4 s on a quiet machine
 
 
 def test_debug_adds_a_traceback_on_either_side_of_the_command():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clra.errors import InputError
-from clra.io.scan_files import read_scan, scan_checksum
+from clra.io.scan_files import read_scan
 from clra.model.scan import Scan
 from clra.model.trajectory import circular
 
@@ -261,9 +261,9 @@ def test_checksum_tells_scans_apart() -> None:
     }
     geometry = circular(5, **detector)
     pixels = np.random.default_rng(0).random((5, 3, 4), np.float32)
-    one = scan_checksum(Scan(pixels, geometry))
-    assert one == scan_checksum(Scan(pixels.astype(np.float64), geometry, name="copy"))
-    assert one != scan_checksum(Scan(pixels[:, ::-1], geometry))
+    one = Scan(pixels, geometry).checksum()
+    assert one == Scan(pixels.astype(np.float64), geometry, name="copy").checksum()
+    assert one != Scan(pixels[:, ::-1], geometry).checksum()
     assert one.startswith("sha256:")
 
 

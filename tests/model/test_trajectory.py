@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.trajectory import (
     PAPER,
@@ -134,3 +135,61 @@ def test_lattice_angle_does_not_depend_on_unit_or_direction():
 def test_wrong_values_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def seen_from_above(angle, point, z):
+    """Pixel (column, row) of a point of a sample that turns before a standing detector."""
+    c, s = math.cos(angle), math.sin(angle)
+    x, y = c * point[0] - s * point[1], s * point[0] + c * point[1]
+    enlarged = 10.0 / (4.0 + y)  # the beam runs along +y
+    return x * enlarged / 0.3, (point[2] - z) * enlarged / 0.3
+
+
+@pytest.mark.parametrize("rotation", ["cw", "ccw"])
+@pytest.mark.parametrize("row0", ["top", "bottom"])
+@pytest.mark.parametrize(
+    ("make", "angles", "heights"),
+    [
+        (lambda **w: circular(5, **w), [2 * math.pi * i / 5 for i in range(5)], [0] * 5),
+        (lambda **w: helix(3, angle_step=0.7, z_step=0.2, **w), [0, 0.7, 1.4], [-0.2, 0, 0.2]),
+        (
+            lambda **w: double_helix(2, angle_step=0.7, z_step=0.2, second="return", **w),
+            [0, 0.7, 1.4, 2.1],
+            [-0.1, 0.1, 0.1, -0.1],
+        ),
+        (
+            lambda **w: space_filling(3, angle_step=2.4, z_step=0.2, **w),
+            [0, 2.4, 4.8],
+            [-0.2, 0, 0.2],
+        ),
+    ],
+)
+def test_words_for_the_sense_of_rotation_and_the_rows(make, angles, heights, rotation, row0):
+    geometry = make(rotation=rotation, row0=row0, **STAGE)
+    point = np.array([0.3, -0.2, 0.15])
+    found = geometry.project(point[None])[:, 0]
+    sense, up = (1 if rotation == "ccw" else -1), (1 if row0 == "bottom" else -1)
+    for pixel, angle, z in zip(found, angles, heights, strict=True):
+        column, row = seen_from_above(sense * angle, point, z)
+        np.testing.assert_allclose(pixel, (3 + column, 2 + up * row), atol=1e-9)
+    assert f"sample turns {rotation}, row 0 at the {row0}" in repr(geometry)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: circular(9, arc=360.0, **STAGE), "arc"),
+        (lambda: helix(9, angle_step=15.3, z_step=0.1, **STAGE), "angle_step"),
+        (lambda: double_helix(9, angle_step=-15.3, z_step=0.1, **STAGE), "angle_step"),
+        (lambda: space_filling(9, angle_step=137.5, z_step=0.1, **STAGE), "angle_step"),
+    ],
+)
+def test_degrees_are_refused(make, name):
+    with pytest.raises(InputError, match=rf"{name}: found .* radians; .* degrees are math.radians"):
+        make()
+
+
+@pytest.mark.parametrize("word", ["rotation", "row0"])
+def test_unknown_words_are_refused(word):
+    with pytest.raises(InputError, match=f"{word}: found 'up', expected one of"):
+        circular(9, **{word: "up"}, **STAGE)

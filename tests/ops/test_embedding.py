@@ -1,6 +1,5 @@
 """Every operator in somebody else's context, queue and memory."""
 
-import math
 import threading
 import time
 import warnings
@@ -18,8 +17,6 @@ from operator_cases import CASES, WITH_SCRATCH, Case, result, values
 from clra.ops.filtering import fft
 from clra.ops.filtering.fft import RealFFT
 from clra.ops.runtime.profile import CPU, GPU, forced
-
-OVERHEAD = 0.2e-3  # s, of a call over the bare launch
 
 
 @pytest.fixture(params=CASES)
@@ -43,8 +40,9 @@ def expected(case, context, queue) -> np.ndarray:
 
 def settles(holds: Callable[[], bool]) -> bool:
     """Whether it holds soon: drivers let go of what they have done when they get round to it."""
-    deadline = time.monotonic() + 5
-    while not holds() and time.monotonic() < deadline:
+    for _ in range(500):
+        if holds():
+            return True
         time.sleep(0.01)
     return holds()
 
@@ -296,47 +294,3 @@ class TestRefusals:
         arrays[-1] = cl_array.zeros(queue, arrays[-1].shape, np.float32, order="F")
         with pytest.raises(ValueError, match=r"found strides \(.*\), expected C order"):
             case.run(case.make(context))(queue, *arrays)
-
-
-# What these do in a call are transforms on the host, where the device is a CPU.
-WITH_TRANSFORMS = (
-    "katsevich",
-    "ramp",
-    "transform",
-    "phase correlation",
-    "registration",
-    "alignment step",
-)
-
-
-@pytest.mark.parametrize("name", [name for name in CASES if name not in WITH_TRANSFORMS])
-def test_a_call_costs_little_more_than_the_bare_launches(name, context, queue, monkeypatch):
-    case = CASES[name]
-    operator = case.run(case.make(context))
-    arrays = [case.empty(queue), *(cl_array.to_device(queue, host) for host in case.inputs)]
-    launches, launch = [], cl.Kernel.__call__
-
-    def noted(kernel, *arguments, **named):
-        launches.append((kernel, arguments))
-        return launch(kernel, *arguments, **named)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cl.Kernel, "__call__", noted)
-        operator(queue, *arrays).wait()
-
-    def bare() -> None:
-        for kernel, arguments in launches:
-            kernel(*arguments)
-
-    # Processor time of this thread, and the least of many: what else runs on the machine is not the
-    # call's.
-    least = [math.inf, math.inf]
-    for _ in range(200):
-        for k, call in enumerate((bare, lambda: operator(queue, *arrays))):
-            queue.finish()
-            start = time.thread_time()
-            call()
-            least[k] = min(least[k], time.thread_time() - start)
-        if least[1] - least[0] < OVERHEAD:
-            break
-    assert least[1] - least[0] < OVERHEAD

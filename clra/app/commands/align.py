@@ -1,6 +1,5 @@
 """Estimate the motion of each radiograph."""
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.errors import InputError
+from clra.findings import Finding
 
 
 def align(
@@ -94,12 +94,13 @@ def align(
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
       clra align scan.nxs -o motion.h5 --autofocus
     """
+    from clra.app.annotations import annotated
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError
     from clra.app.output_checks import focus_attributes, matched
     from clra.app.plausible import doubt_of_turning
-    from clra.app.records import Record
     from clra.app.report.summary import Errors, findings_of, summary_of
+    from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
@@ -126,14 +127,12 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = None if start is None else Record.load(start)
+    earlier = None if start is None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
     about = {
         "file": str(scan.absolute()),
         "geometry": reading.geometry(),
-        "estimate": estimate,
-        "unobservable": "taken out" if gauge == "anchored" and method != "reference" else "left in",
         "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
         f"--estimate {estimate} --gauge {gauge}"
         f"{'' if reference is None else f' --reference {reference}'}"
@@ -160,15 +159,15 @@ def align(
                 **limits,
             )
         except AlignmentInterrupted as stopped:
-            record = Record.of(stopped.result, opened, earlier, interrupted="yes", **about)
-            record.save(out)
-            last = record.history[-1]
+            result = annotated(stopped.result, opened, earlier, interrupted="yes", **about)
+            write_alignment(out, result)
+            last = result.history[-1]
             raise InterruptedCommandError(
-                f"{out} keeps what {len(record.history)} iterations gave, the last at "
+                f"{out} keeps what {len(result.history)} iterations gave, the last at "
                 f"{last.level}; --start {out} goes on from there"
             ) from None
-        record = Record.of(result, opened, earlier, **about)
-        record.save(out)
+        result = annotated(result, opened, earlier, **about)
+        write_alignment(out, replace(result, volume=None))
         turned = sharpening_by_turning_back(
             opened.cropped(),
             result.motion.about(*opened.window_offset),
@@ -177,10 +176,13 @@ def align(
             **limits,
         )
         more = {"sharpening_by_turning_back": f"{turned:.3f}"}
-        record = replace(record, about={**record.about, **more})
-        record.save(out)
-        doubts = [doubt_of_turning(turned)]
-        errors = Errors.of(record, opened)
+        doubt = doubt_of_turning(turned)
+        doubts = [Finding("rotation", doubt)] if doubt else []
+        result = replace(
+            result, about={**result.about, **more}, warnings=(*result.warnings, *doubts)
+        )
+        write_alignment(out, replace(result, volume=None))
+        errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
             write_volume(volume, result.volume, grid, progress=progress)
@@ -188,7 +190,7 @@ def align(
             from clra.app.report.html_report import write_report
 
             findings = findings_of(
-                record,
+                result,
                 opened,
                 volume=result.volume,
                 device=console.device,
@@ -196,10 +198,11 @@ def align(
                 **limits,
             )
             write_report(report, findings)
-            doubts += set(findings.notes) - set(record.notes)
-    for doubt in filter(None, doubts):
-        warnings.warn(doubt, stacklevel=1)
-    values, text = summary_of(record, errors)
+            known = {str(finding) for finding in result.warnings}
+            doubts += [Finding("report", note) for note in findings.notes if note not in known]
+    for finding in doubts:
+        finding.warn()
+    values, text = summary_of(result, errors)
     beside = {"volume": volume, "report": report}
     written = {"file": out, **{name: path for name, path in beside.items() if path}}
     names = " and ".join(str(path) for path in written.values())

@@ -31,20 +31,20 @@ def correct(
     --------
       clra correct scan.nxs --motion motion.h5 -o corrected.nxs
     """
-    from clra.app.output_checks import motion_for, room_for
+    from clra.app.output_checks import alignment_for, room_for
     from clra.app.scan_description import views_flagged
     from clra.io.scan_files import write_scan
     from clra.methods.correction import correct as correct_scan
 
     limits = memory.limits()
     opened = reading.scan(scan)
-    opened, known, valid_views = motion_for(opened, motion, reading.geometry())
+    opened, alignment = alignment_for(opened, motion, reading.geometry())
     views, rows, columns = opened.shape
     room_for(out, 4 * views * rows * columns, keep=(scan, motion))
     with console.progress() as progress:
-        corrected = correct_scan(opened, known, console.device, **limits)
-        write_scan(out, corrected, valid_views=valid_views, progress=progress)
-    invalid = (~valid_views).nonzero()[0].tolist()
+        corrected = correct_scan(opened, alignment.motion, console.device, **limits)
+        write_scan(out, corrected, valid_views=alignment.valid_views, progress=progress)
+    invalid = alignment.flagged
     marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
     console.summary(
         {"file": out, "shape": opened.shape, "invalid": invalid},

@@ -9,20 +9,24 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
     """Describe a scan and what it will take.
 
     Memory and time of a reconstruction and of an iteration of alignment at each level of
-    resolution, estimated from a small test on the device. Nothing is written.
+    resolution, estimated from a small test on the device. Of a scanner's files also what their
+    metadata tell, and what had to be assumed. Nothing is written.
 
     Examples
     --------
       clra info scan.nxs
       clra info scan.nxs --json
+      clra info Lego.xtekct
     """
     from clra.app.cost import costs_of, costs_table
-    from clra.app.scan_description import Facts, table
+    from clra.app.scan_description import Facts, scanner_text, table
     from clra.app.speed import Speed, measure
     from clra.errors import DeviceError
 
     limits = memory.limits()
-    opened = reading.scan(scan)
+    scanner = reading.scanner(scan)
+    unread = scanner is not None and (scanner.missing or not scanner.normalisable(reading.white))
+    opened = scanner.described() if scanner is not None and unread else reading.scan(scan)
     facts = Facts.of(opened)
     try:
         with console.progress() as report:
@@ -33,5 +37,12 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
         warnings.warn(f"no times: {error}", stacklevel=1)
         speed = Speed.unknown()
     costs = costs_of(opened.geometry, speed)
-    text = f"{table(facts.lines())}\n\n{costs_table(costs, speed)}"
-    console.result({"scan": facts, "device": speed.device, "levels": costs}, text)
+    told = "" if scanner is None else f"\n\n{scanner_text(scanner)}"
+    text = f"{table(facts.lines())}{told}\n\n{costs_table(costs, speed)}"
+    values = {"scan": facts, "device": speed.device, "levels": costs}
+    if scanner is not None:
+        values["scanner"] = {
+            **scanner.contents(),
+            "findings": [finding.as_dict() for finding in scanner.findings],
+        }
+    console.result(values, text)

@@ -105,7 +105,7 @@ def reconstruct(
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
     """
     from clra.app.arguments import volume_file
-    from clra.app.output_checks import motion_for, room_for
+    from clra.app.output_checks import alignment_for, room_for
     from clra.app.scan_description import metric
     from clra.io.volumes.volume_files import open_volume
     from clra.methods.reconstruction.iterative import sorted_options
@@ -130,7 +130,8 @@ def reconstruct(
     sorted_options(method, options)
     known = valid_views = None
     if motion is not None:
-        opened, known, valid_views = motion_for(opened, motion, reading.geometry())
+        opened, alignment = alignment_for(opened, motion, reading.geometry())
+        known, valid_views = alignment.motion, alignment.valid_views
     nz, ny, nx = grid.shape
     room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
     steps: tuple[ImgrStep, ...] = ()

@@ -32,19 +32,19 @@ def report(
       clra report motion.h5 -o report.html --scan scan.nxs
     """
     from clra.app.output_checks import matched
-    from clra.app.records import Record
     from clra.app.report.html_report import write_report
     from clra.app.report.summary import findings_of
+    from clra.io.alignment_file import read_alignment
     from clra.io.atomic import ensure_writable
 
     limits = memory.limits()
-    record = Record.load(motion)
+    result = read_alignment(motion)
     ensure_writable(out, keep=(motion, scan))
     opened = None if scan is None else reading.scan(scan)
     if opened is not None:
-        opened = matched(opened, record, motion, reading.geometry())
+        opened = matched(opened, result, motion, reading.geometry())
     with console.progress() as progress:
-        findings = findings_of(record, opened, device=console.device, progress=progress, **limits)
+        findings = findings_of(result, opened, device=console.device, progress=progress, **limits)
     write_report(out, findings)
     told = {} if findings.quality is None else {"quality": findings.quality}
     console.summary({"file": out, **told}, f"wrote {out}")

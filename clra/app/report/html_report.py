@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from clra.app.progress_bar import duration
-from clra.app.records import Record
 from clra.app.report import figures, page
 from clra.app.report.before_after import before_and_after
 from clra.app.report.summary import Errors, Findings
 from clra.app.scan_description import listed
 from clra.io.atomic import atomic_path
 from clra.methods.alignment.quality import Quality
-from clra.methods.alignment.result import Iteration
+from clra.methods.alignment.result import AlignmentResult, Iteration
 
 _COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
 _UNOBSERVABLE = {
@@ -54,7 +53,7 @@ def render(findings: Findings) -> str:
     findings : Findings
         What to tell.
     """
-    record = findings.record
+    result = findings.result
     body = [
         page.cards(_cards(findings)),
         *(
@@ -62,31 +61,31 @@ def render(findings: Findings) -> str:
             if findings.notes
             else []
         ),
-        _corrections(record),
-        *([_history(record.history)] if record.history else []),
+        _corrections(result),
+        *([_history(result.history)] if result.history else []),
         *([_errors(findings.errors)] if findings.errors else []),
         *before_and_after(findings.comparison),
-        _trust(record),
+        _trust(result),
         *([_quality(findings.quality)] if findings.quality else []),
         _settings(findings),
     ]
-    subtitle = [f"{record.motion.views} radiographs"]
-    if record.history:
-        subtitle.append(f"aligned in {duration(sum(i.seconds for i in record.history))}")
-    if record.about.get("device"):
-        subtitle.append(f"on {record.about['device']}")
-    name = record.about.get("scan") or "a scan"
+    subtitle = [f"{result.motion.views} radiographs"]
+    if result.history:
+        subtitle.append(f"aligned in {duration(sum(i.seconds for i in result.history))}")
+    if result.device:
+        subtitle.append(f"on {result.device}")
+    name = result.scan or "a scan"
     versions = ", ".join(f"{name} {version}" for name, version in _versions().items())
     return page.page(f"Alignment of {name}", " ".join(subtitle), body, f"Made by {versions}.")
 
 
 def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:
-    record = findings.record
-    motion, confidence = record.motion, record.confidence
+    result = findings.result
+    motion, confidence = result.motion, result.confidence
     aside = np.abs(np.stack([motion.shift_u, motion.shift_v]))
     median, largest = np.median(aside, axis=1), aside.max(axis=1)
     scale = motion.magnification
-    flagged = len(record.flagged)
+    flagged = len(result.flagged)
     cards = [
         ("Shift, median", f"{median[0]:.2f}, {median[1]:.2f}", "pixel", "|u|, |v|"),
         ("Shift, largest", f"{largest[0]:.2f}, {largest[1]:.2f}", "pixel", "|u|, |v|"),
@@ -111,19 +110,19 @@ def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:
         ):
             value = f"{means[f'{prefix}_u']:.3f}, {means[f'{prefix}_v']:.3f}"
             cards.append((name, value, "pixel", note))
-    elif record.history:
-        last = record.history[-1]
+    elif result.history:
+        last = result.history[-1]
         value = f"{last.update_u_median:.3f}, {last.update_v_median:.3f}"
         cards.append(("Last update, median", value, "pixel", "|u|, |v|; converged below 0.1"))
     return cards
 
 
-def _corrections(record: Record) -> str:
-    returns = record.about.get("path") == "double helix"
+def _corrections(result: AlignmentResult) -> str:
+    returns = result.about.get("path") == "double helix"
     return page.section(
         "Correction of each radiograph",
         page.figure(
-            figures.corrections(record.motion, returns=returns),
+            figures.corrections(result.motion, returns=returns),
             "Shift (left) and magnification (right) that bring each measured radiograph back to "
             "where the ideal geometry puts it: the inverse of the estimated motion. Positive u is "
             "toward higher columns, positive v toward higher rows; in pixels of the full detector."
@@ -200,19 +199,19 @@ def _errors(errors: Errors) -> str:
     )
 
 
-def _trust(record: Record) -> str:
-    flagged = record.flagged
+def _trust(result: AlignmentResult) -> str:
+    flagged = result.flagged
     parts = [
         page.figure(
-            figures.confidence(record.confidence, flagged),
+            figures.confidence(result.confidence, flagged),
             "Correlation of each measured radiograph with its re-projection in the band of "
             "frequencies that is registered. A flagged view fits far worse than the others; it was "
             "given the motion of its neighbours.",
             "Confidence against view number",
         )
     ]
-    if record.sigma:
-        u, v, m = record.sigma
+    if result.median_sigma:
+        u, v, m = result.median_sigma
         parts.append(
             page.paragraph(
                 f"Standard error of a view's registration, median: {u:.3f} pixel in u, {v:.3f} "
@@ -221,15 +220,15 @@ def _trust(record: Record) -> str:
         )
     if flagged:
         parts.append(page.paragraph(f"Flagged views: {listed(flagged, 40)}."))
-    if record.gauge:
-        unobservable = record.about.get("unobservable", "")
+    if result.gauge:
+        unobservable = result.about.get("unobservable", "")
         parts += [
             page.paragraph(
                 "Gauge content: root mean square of the part of the motion found that each "
                 "movement of the sample as a whole would explain. Radiographs hardly see it, and "
                 "the volume is as sharp with it as without." + _UNOBSERVABLE.get(unobservable, "")
             ),
-            page.bars(record.gauge, "pixel"),
+            page.bars(result.gauge, "pixel"),
         ]
     return page.section("How far to trust it", *parts)
 
@@ -258,16 +257,20 @@ def _quality(quality: Quality) -> str:
             "gradient inside the field of view, relative to before; noise counts as sharp, too. "
             "Half scans: every view is registered with two volumes, from the even and from the "
             "odd-numbered views; how far they differ is how well the data hold the shifts. In "
-            "simulations it was 0.02 to 0.05 pixel with the true motion and 0.04 to 0.11 when each view was "
-            "0.25 pixel off; what both halves share, as a movement of the sample, it cannot show."
+            "simulations it was 0.02 to 0.05 pixel with the true motion and 0.04 to 0.11 when "
+            "each view was 0.25 pixel off; what both halves share, as a movement of the sample, it "
+            "cannot show."
         ),
         page.paragraph(f"Measured with radiographs binned by {quality.level}."),
     )
 
 
 def _settings(findings: Findings) -> str:
-    about = dict(findings.record.about)
-    command = about.pop("command", None)
+    result = findings.result
+    names = ("scan", "checksum", "method", "schedule", "estimate", "device")
+    about = {name: getattr(result, name) for name in names} | dict(result.about)
+    about |= {f"{name} version": version for name, version in result.versions.items()}
+    command = result.command
     if findings.facts:
         about.pop("path", None)  # they tell more of it
     about = {key: value for key, value in about.items() if value}

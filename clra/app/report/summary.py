@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from clra.app.plausible import doubt_of_shifts
 from clra.app.progress_bar import duration
-from clra.app.records import Record
 from clra.app.scan_description import Facts, table, views_flagged
+from clra.methods.alignment.result import AlignmentResult
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
@@ -42,27 +42,27 @@ class Errors:
     valid_views: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, record: Record, scan: Scan) -> "Errors | None":
+    def of(cls, result: AlignmentResult, scan: Scan) -> "Errors | None":
         """Compare an estimate with the truth, if the scan knows it.
 
         Parameters
         ----------
-        record : Record
+        result : AlignmentResult
             Of an alignment of the scan.
         scan : Scan
             With its geometry, and its truth if it is a simulation.
         """
         if scan.truth is None:
             return None
-        motion, truth = record.motion, scan.truth
+        motion, truth = result.motion, scan.truth
         difference = Motion(
             shift_u=motion.shift_u - truth.shift_u,
             shift_v=motion.shift_v - truth.shift_v,
             magnification=1 + (motion.magnification - truth.magnification),
         )
         points = sample_points(default_grid(scan.geometry))
-        fit = Gauge(scan.geometry, points, magnification=record.scale_estimated).fit(difference)
-        return cls(fit.part + fit.remainder, fit.remainder, record.valid_views)
+        fit = Gauge(scan.geometry, points, magnification=result.scale_estimated).fit(difference)
+        return cls(fit.part + fit.remainder, fit.remainder, result.valid_views)
 
     def means(self) -> dict[str, float]:
         """Mean absolute errors by name; those of valid views where some are not."""
@@ -83,7 +83,7 @@ class Findings:
 
     Attributes
     ----------
-    record : Record
+    result : AlignmentResult
         Of the alignment.
     errors : Errors, optional
         Where the truth is known.
@@ -95,7 +95,7 @@ class Findings:
         What the radiographs alone tell, where the scan was at hand.
     """
 
-    record: Record
+    result: AlignmentResult
     errors: Errors | None = None
     comparison: "Comparison | None" = None
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -104,12 +104,13 @@ class Findings:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the run warned of, and what the scan itself tells against its result."""
-        doubt = "" if self.quality is None else doubt_of_shifts(self.quality, self.record.motion)
-        return (*self.record.notes, doubt) if doubt else self.record.notes
+        doubt = "" if self.quality is None else doubt_of_shifts(self.quality, self.result.motion)
+        told = (*map(str, self.result.warnings), doubt)
+        return tuple(dict.fromkeys(filter(None, told)))
 
 
 def findings_of(
-    record: Record,
+    result: AlignmentResult,
     scan: Scan | None,
     *,
     volume: NDArray[np.float32] | None = None,
@@ -122,7 +123,7 @@ def findings_of(
 
     Parameters
     ----------
-    record : Record
+    result : AlignmentResult
         Of the alignment.
     scan : Scan, optional
         The one that was aligned.
@@ -136,7 +137,7 @@ def findings_of(
         Bytes that may be used.
     """
     if scan is None:
-        return Findings(record)
+        return Findings(result)
     from clra.app.report.comparison import compare, volume_level
     from clra.methods.alignment.quality import quality
     from clra.ops.streaming.stream import Stream
@@ -148,13 +149,13 @@ def findings_of(
         report=progress,
     )
     part = scan.cropped()
-    motion = record.motion.about(*scan.window_offset)
+    motion = result.motion.about(*scan.window_offset)
     return Findings(
-        record,
-        errors=Errors.of(record, scan),
-        comparison=compare(stream, part, motion, record.confidence, record.valid_views, volume),
-        quality=quality(stream, part, motion, volume_level(part), record.valid_views)
-        if _in_both_halves(record.valid_views)
+        result,
+        errors=Errors.of(result, scan),
+        comparison=compare(stream, part, motion, result.confidence, result.valid_views, volume),
+        quality=quality(stream, part, motion, volume_level(part), result.valid_views)
+        if _in_both_halves(result.valid_views)
         else None,
         facts=Facts.of(scan).lines(),
     )
@@ -165,12 +166,12 @@ def _in_both_halves(valid_views: NDArray[np.bool_]) -> bool:
     return bool(valid_views[::2].sum() > 1 and valid_views[1::2].sum() > 1)
 
 
-def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], str]:
+def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str, Any], str]:
     """Sum an alignment up.
 
     Parameters
     ----------
-    record : Record
+    result : AlignmentResult
         Of the alignment.
     errors : Errors, optional
         Where the truth is known.
@@ -182,71 +183,71 @@ def summary_of(record: Record, errors: Errors | None) -> tuple[dict[str, Any], s
     text : str
         For people.
     """
-    motion, confidence = record.motion, record.confidence
+    motion, confidence = result.motion, result.confidence
     aside = np.abs(np.stack([motion.shift_u, motion.shift_v]))
     (median_u, median_v), (largest_u, largest_v) = np.median(aside, axis=1), aside.max(axis=1)
     least, most = motion.magnification.min(), motion.magnification.max()
-    seconds = sum(iteration.seconds for iteration in record.history)
+    seconds = sum(iteration.seconds for iteration in result.history)
     values = {
         "views": motion.views,
         "median_shift": [median_u, median_v],
         "largest_shift": [largest_u, largest_v],
         "magnification": [least, most],
         "confidence_median": np.median(confidence),
-        "flagged": record.flagged,
-        "gauge": record.gauge,
-        "schedule": record.about.get("schedule", ""),
-        "device": record.about.get("device", ""),
+        "flagged": result.flagged,
+        "gauge": result.gauge,
+        "schedule": result.schedule,
+        "device": result.device,
         "seconds": seconds,
-        "history": record.history,
+        "history": result.history,
         **(errors.means() if errors else {}),
     }
     lines = {
-        "run": f"{motion.views} views, {_levels(record)}, {duration(seconds)}",
+        "run": f"{motion.views} views, {_levels(result)}, {duration(seconds)}",
         "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
         f"largest {largest_u:.2f}, {largest_v:.2f}",
         "magnification": f"{least:.5f} to {most:.5f}",
-        "confidence": f"median {np.median(confidence):.3f}, {views_flagged(record.flagged)}",
+        "confidence": f"median {np.median(confidence):.3f}, {views_flagged(result.flagged)}",
     }
-    if record.gauge:
-        lines["unobservable"] = _unobservable(record)
-    if "detector_offset_u" in record.about:
-        offset, tilt = (record.about[name] for name in ("detector_offset_u", "detector_tilt"))
+    if result.gauge:
+        lines["unobservable"] = _unobservable(result)
+    if "detector_offset_u" in result.about:
+        offset, tilt = (result.about[name] for name in ("detector_offset_u", "detector_tilt"))
         values |= {"detector_offset_u": offset, "detector_tilt": tilt}
         lines["detector"] = (
             f"axis {offset} aside, image turned by {tilt}; slices sharper by a factor of "
-            f"{record.about.get('detector_sharpening', '?')}"
+            f"{result.about.get('detector_sharpening', '?')}"
         )
-    if "source_travel" in record.about:
-        values["source_travel"] = lines["source"] = record.about["source_travel"]
+    if "source_travel" in result.about:
+        values["source_travel"] = lines["source"] = result.about["source_travel"]
     if errors:
         means = errors.means()
-        lines["error"] = _error(means, "", record)
-        if record.flagged:
-            lines["not flagged"] = _error(means, "believed_", record)
+        lines["error"] = _error(means, "", result)
+        if result.flagged:
+            lines["not flagged"] = _error(means, "believed_", result)
     return values, table(lines)
 
 
-def _unobservable(record: Record) -> str:
+def _unobservable(result: AlignmentResult) -> str:
     """Tell the gauge by mode, the largest first, as far as it can be seen."""
-    parts = sorted(record.gauge.items(), key=lambda mode: -mode[1])
-    what = record.about.get("unobservable")
+    parts = sorted(result.gauge.items(), key=lambda mode: -mode[1])
+    what = result.about.get("unobservable")
     told = ", ".join(f"{name} {size:.2f}" for name, size in parts if size >= 0.005)
     return f"{told or 'below 0.01'} pixel rms" + (f", {what}" if what else "")
 
 
-def _error(means: Mapping[str, float], which: str, record: Record) -> str:
+def _error(means: Mapping[str, float], which: str, result: AlignmentResult) -> str:
     raw, free = (
         f"{means[f'{which}{name}_u']:.3f}, {means[f'{which}{name}_v']:.3f}"
         for name in ("mae", "gauge_free_mae")
     )
     scale = f"; magnification {means[f'{which}mae_magnification']:.1e}"
     return f"mean {raw} pixel along u, v against the truth; gauge-free {free}" + (
-        scale if record.scale_estimated else ""
+        scale if result.scale_estimated else ""
     )
 
 
-def _levels(record: Record) -> str:
+def _levels(result: AlignmentResult) -> str:
     """Count the iterations at each level: "4QR-1HR"."""
-    levels = [iteration.level for iteration in record.history]
+    levels = [iteration.level for iteration in result.history]
     return "-".join(f"{levels.count(level)}{level}" for level in dict.fromkeys(levels))

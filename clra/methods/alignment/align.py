@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from clra.errors import InputError
+from clra.findings import collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
@@ -15,6 +16,7 @@ from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
+from clra.ops.runtime.versions import versions
 from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
@@ -99,63 +101,67 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    # What the mask leaves of the detector is aligned as a detector of its own.
+    part = scan.cropped()
+    stages = parse_schedule(schedule, part.geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
         if given is not None and given.views != scan.views:
             raise InputError(f"{name}: found {given.views} views, expected {scan.views}")
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
-    # What the mask leaves of the detector is aligned as a detector of its own.
-    whole, scan = scan, scan.cropped()
-    aside = whole.window_offset
-    stages = parse_schedule(schedule, scan.geometry.shape) if method == "ra" else ()
+    if motion is not None:
+        motion = motion.about(*scan.window_offset)
+    truth = scan.truth if truth is None else truth
+    truth = None if truth is None else truth.about(*scan.window_offset)
     stream = Stream(
         device,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
         report=progress,
     )
-    truth = scan.truth if truth is None else truth.about(*aside)
-    motion = None if motion is None else motion.about(*aside)
-    if reference is not None:
-        if reference.geometry.shape == whole.geometry.shape:
-            reference = replace(reference, mask=whole.mask).cropped()
-        drift = align_to_reference(stream, scan, reference, scale=estimate != "shift", truth=truth)
-        if method == "reference":
-            return _on_detector(drift, whole)
-        motion = drift.motion
-    grid = grid or default_grid(scan.geometry)
-    solver, anchor = solver or Solver(), gauge == "anchored"
-    scale = estimate != "shift" and solver.estimator == "gauss-newton"
-    start = motion or Motion.identity(scan.views)
-    start = start.caused_by("source" if estimate == "source" else "detector")
-    try:
-        if method == "imgr":
-            solved = _by_imgr(
-                stream,
-                scan,
-                grid,
-                levels=schedule,
-                align=True,
-                scale=scale,
-                anchor=anchor,
-                motion=start,
-                truth=truth,
-            )
-            return _on_detector(solved, whole)
-        run = CoarseToFine(
-            stream, scan, with_margin(grid), schedule, scale, anchor, solver, start, truth
+    anchor = gauge == "anchored" and method != "reference"
+
+    def told(result: AlignmentResult) -> AlignmentResult:
+        """Add what is known of any run, for the whole detector."""
+        offset_u, offset_v = scan.window_offset
+        return replace(
+            result,
+            motion=result.motion.about(-offset_u, -offset_v),
+            warnings=tuple(findings),
+            method=method,
+            estimate=estimate,
+            versions=versions(stream.device),
+            scan=scan.name,
+            checksum=scan.checksum(),
+            about={"unobservable": "taken out" if anchor else "left in"},
         )
-        run.align(stages)
-    except AlignmentInterrupted as stopped:
-        raise AlignmentInterrupted(_on_detector(stopped.result, whole)) from None
-    return _on_detector(run.result(), whole)
 
-
-def _on_detector(result: AlignmentResult, scan: Scan) -> AlignmentResult:
-    """Return a result for what the mask leaves as one for the whole detector."""
-    offset_u, offset_v = scan.window_offset
-    return replace(result, motion=result.motion.about(-offset_u, -offset_v))
+    scale = estimate != "shift"
+    with collected() as findings:
+        if reference is not None:
+            if reference.geometry.shape == scan.geometry.shape:
+                reference = replace(reference, mask=scan.mask).cropped()
+            drift = align_to_reference(stream, part, reference, scale=scale, truth=truth)
+            if method == "reference":
+                return told(drift)
+            motion = drift.motion
+        start = motion or Motion.identity(scan.views)
+        start = start.caused_by("source" if estimate == "source" else "detector")
+        grid = grid or default_grid(part.geometry)
+        solver = solver or Solver()
+        scale = scale and solver.estimator == "gauss-newton"
+        try:
+            if method == "imgr":
+                options = {"scale": scale, "anchor": anchor, "motion": start, "truth": truth}
+                return told(_by_imgr(stream, part, grid, levels=schedule, align=True, **options))
+            run = CoarseToFine(
+                stream, part, with_margin(grid), schedule, scale, anchor, solver, start, truth
+            )
+            run.align(stages)
+        except AlignmentInterrupted as stopped:
+            raise AlignmentInterrupted(told(stopped.result)) from None
+        return told(run.result())
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:

@@ -83,7 +83,8 @@ def align_to_reference(
 
     return AlignmentResult(
         motion=motion,
-        history=[
+        valid_views=np.ones(scan.views, np.bool_),
+        history=(
             Iteration.of(
                 "FR",
                 1,
@@ -92,12 +93,11 @@ def align_to_reference(
                 found.residual,
                 time.perf_counter() - started,
                 **({} if truth is None else gauge.error(motion, truth).means()),
-            )
-        ],
+            ),
+        ),
         confidence=np.clip(everywhere(found.correlation), 0.0, 1.0),
         sigma=np.stack([everywhere(column) for column in found.sigma.T], axis=1),
         gauge=dict(gauge.fit(motion).rms_by_mode),
-        flagged=(),
         schedule="reference",
         device=stream.device.name.strip(),
     )

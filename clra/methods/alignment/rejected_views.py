@@ -1,7 +1,5 @@
 """Views that are rejected: blank, saturated, or not of this sample."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
@@ -98,13 +96,6 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
     spread = 1.4826 * np.median(np.abs(correlation - middle))
     least = min(_LEAST, _LACK * (1 - middle))
     return np.asarray(correlation < middle - max(_DEVIATIONS * spread, least))
-
-
-def all_but(flagged: Sequence[int], views: int) -> NDArray[np.bool_]:
-    """Return which of the views are valid_views, (views,): all but the flagged ones."""
-    valid_views = np.ones(views, np.bool_)
-    valid_views[list(flagged)] = False
-    return valid_views
 
 
 def neighbour_weights(source: Floats, valid_views: NDArray[np.bool_]) -> Floats:

@@ -1,12 +1,14 @@
 """What an alignment returns."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
+from clra.findings import Finding
 from clra.methods.alignment.reprojection import Registered
 from clra.model.gauge.gauge import GaugeFit
 from clra.model.motion import Motion
@@ -82,42 +84,87 @@ class Iteration:
         )
 
 
-@dataclass(frozen=True)
+class SupportsAsDict(Protocol):
+    """What is known of how far an alignment can be trusted; plain values describe it."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class AlignmentResult:
-    """What alignment found and how good it is.
+    """What alignment found, how good it is and where it comes from.
+
+    :func:`clra.write_alignment` and :func:`clra.read_alignment` keep all of it;
+    :func:`clra.reconstruct` and :func:`clra.correct` take it as it is.
 
     Attributes
     ----------
     motion : Motion
         Of each view, in pixels of the full-resolution detector; mean(log magnification) = 0.
-    history : list of Iteration
-        One entry an iteration.
+    valid_views : ndarray of bool, (views,)
+        Views whose registration is accepted. The others have their neighbours' motion, and are left
+        out of reconstructions.
     confidence : ndarray, (views,)
         Correlation of each measured radiograph with its simulated counterpart in the band used,
-        clipped to 0..1, after the last registration.
+        clipped to 0..1, after the last registration; 0 for rejected views.
     sigma : ndarray, (views, 3)
-        Standard errors of shift_u, shift_v [pixel] and magnification, from that registration.
+        Standard errors of shift_u, shift_v [pixel] and magnification; NaN where not estimated.
+    history : tuple of Iteration
+        One entry an iteration.
     gauge : dict of str to float
         RMS [pixel] of the part of the last estimate that each movement of the sample as a whole
         explains. The data hardly see that part; the volume is as sharp with it as without. With
         ``gauge="anchored"`` it is not in `motion` any more.
-    flagged : tuple of int
-        Views whose registration is rejected; they have their neighbours' motion.
-    schedule, device : str
-        What was run, and on what.
+    quality : SupportsAsDict, optional
+        How far to trust it, where that was measured.
+    warnings : tuple of Finding
+        What was found on the way that tells against the result or the scan.
     volume : ndarray of float32, (nz, ny, nx), optional
         Attenuation [1/mm], where the method reconstructs as it aligns.
+    method, schedule, estimate : str
+        What was run; "" where it is not known.
+    device : str
+        On what.
+    command : str
+        The command line or the call.
+    versions : dict of str to str
+        Of "clra", "pyopencl" and the device's "driver".
+    scan, checksum : str
+        Name of the scan, and :meth:`Scan.checksum` of it.
+    about : dict of str to str
+        What else is known of the run, such as "unobservable" (whether the gauge was "taken out" of
+        the motion or "left in"), or where an auto-focus found the detector.
     """
 
     motion: Motion
-    history: list[Iteration]
+    valid_views: NDArray[np.bool_]
     confidence: Floats
     sigma: Floats
-    gauge: dict[str, float]
-    flagged: tuple[int, ...]
-    schedule: str
-    device: str
+    history: tuple[Iteration, ...] = ()
+    gauge: Mapping[str, float] = field(default_factory=dict)
+    quality: SupportsAsDict | None = None
+    warnings: tuple[Finding, ...] = ()
     volume: NDArray[np.float32] | None = None
+    method: str = ""
+    schedule: str = ""
+    estimate: str = ""
+    device: str = ""
+    command: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    scan: str = ""
+    checksum: str = ""
+    about: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        views = self.motion.views
+        for name, shape in (("valid_views", (views,)), ("confidence", (views,))):
+            if getattr(self, name).shape != shape:
+                found = getattr(self, name).shape
+                raise InputError(f"{name}: found shape {found}, expected {shape} as in motion")
+        if self.sigma.ndim != 2 or len(self.sigma) != views:
+            raise InputError(f"sigma: found shape {self.sigma.shape}, expected ({views}, 3)")
 
     @classmethod
     def of(
@@ -133,14 +180,83 @@ class AlignmentResult:
         """Sum up what the last registration found; views that are `rejected` have no confidence."""
         return cls(
             motion=motion,
-            history=list(history),
+            valid_views=~rejected,
+            history=tuple(history),
             confidence=np.clip(np.where(rejected, 0.0, registered.correlation), 0.0, 1.0),
             sigma=registered.sigma,
             gauge=dict(gauge.rms_by_mode),
-            flagged=tuple(int(view) for view in np.flatnonzero(rejected)),
             schedule=schedule,
             device=device.strip(),
         )
+
+    @classmethod
+    def from_motion(
+        cls, motion: Motion, valid_views: NDArray[np.bool_] | None = None
+    ) -> "AlignmentResult":
+        """Return a result for a motion that is known from elsewhere.
+
+        Parameters
+        ----------
+        motion : Motion
+            Of each view.
+        valid_views : ndarray of bool, (views,), optional
+            All by default.
+        """
+        valid = np.ones(motion.views, np.bool_) if valid_views is None else valid_views
+        return cls(
+            motion=motion,
+            valid_views=valid,
+            confidence=valid.astype(np.float64),
+            sigma=np.full((motion.views, 3), np.nan),
+        )
+
+    @property
+    def flagged(self) -> tuple[int, ...]:
+        """Rejected views, from 0."""
+        return tuple(np.flatnonzero(~self.valid_views).tolist())
+
+    @property
+    def scale_estimated(self) -> bool:
+        """Whether magnifications were estimated."""
+        return bool(np.any(self.motion.magnification != 1))
+
+    @property
+    def median_sigma(self) -> tuple[float, float, float] | None:
+        """Medians over the views of the standard errors, where they are known."""
+        known = self.sigma[np.isfinite(self.sigma[:, :2]).all(axis=1), :3]
+        if not len(known):
+            return None
+        u, v, m = np.median(known, axis=0).tolist()
+        return u, v, m
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, AlignmentResult):
+            return NotImplemented
+        return all(
+            _same(getattr(self, f.name), getattr(other, f.name)) for f in fields(AlignmentResult)
+        )
+
+    def __repr__(self) -> str:
+        u, v = (np.median(np.abs(s)) for s in (self.motion.shift_u, self.motion.shift_v))
+        verdict = getattr(self.quality, "verdict", "")
+        parts = (
+            f"{self.motion.views} views",
+            f"{len(self.flagged)} rejected",
+            f"median |shift| {u:.2f}, {v:.2f} pixel",
+            " ".join(filter(None, (self.method, self.schedule))),
+            f"{len(self.history)} iterations" if self.history else "",
+            f"{len(self.warnings)} warnings" if self.warnings else "",
+            verdict,
+        )
+        return f"AlignmentResult({', '.join(filter(None, parts))})"
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values of a field are equal; NaN, not estimated, equals itself."""
+    if not (isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
+        return type(one) is type(other) and bool(one == other)
+    numbers = one.dtype.kind == "f" and other.dtype.kind == "f"
+    return np.array_equal(one, other, equal_nan=numbers)
 
 
 class AlignmentInterrupted(KeyboardInterrupt):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.alignment.align import align as align_scan
-from clra.methods.alignment.rejected_views import all_but
+from clra.methods.alignment.result import AlignmentResult
 from clra.methods.correction import corrected
 from clra.methods.execution.several_devices import on_devices
 from clra.methods.reconstruction import iterative
@@ -40,6 +40,7 @@ def reconstruct(
     align: bool = False,
     device: Any = None,
     *,
+    alignment: AlignmentResult | None = None,
     valid_views: NDArray[np.bool_] | None = None,
     progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
@@ -69,10 +70,12 @@ def reconstruct(
     device : str or cl.Device, optional
         As `choose_device` takes it, or "all" to share the work out to all
         devices of the best kind; alignment and iterative methods take the first of them.
+    alignment : AlignmentResult, optional
+        In place of `motion`: views that it rejects are left out.
     valid_views : ndarray of bool, (views,), optional
-        Views to reconstruct from, such as ``result.confidence > 0``; all by default, with `align`
-        those that are not flagged. "katsevich" needs every view: what lies between the radiographs
-        beside stands in for the others, and for views that the scan lacks.
+        Views to reconstruct from; by default all, or those that the alignment did not reject.
+        "katsevich" needs every view: what lies between the radiographs beside stands in for the
+        others, and for views that the scan lacks.
     progress : callable, optional
         Called with a :class:`clra.progress.Progress` as work goes on.
     max_device_memory, max_host_memory : int, optional
@@ -104,6 +107,7 @@ def reconstruct(
         motion,
         align,
         device,
+        alignment=alignment,
         valid_views=valid_views,
         progress=progress,
         max_device_memory=max_device_memory,
@@ -122,6 +126,7 @@ def reconstruct_into(
     align: bool = False,
     device: Any = None,
     *,
+    alignment: AlignmentResult | None = None,
     valid_views: NDArray[np.bool_] | None = None,
     progress: ProgressCallback | None = None,
     max_device_memory: int | None = None,
@@ -135,8 +140,8 @@ def reconstruct_into(
     target : PlaneWriter
         Takes the planes, each once; `open_volume` gives one that writes a
         file.
-    scan, method, grid, motion, align, device, valid_views, progress, max_device_memory, \
-    max_host_memory, options
+    scan, method, grid, motion, align, device, alignment, valid_views, progress, \
+    max_device_memory, max_host_memory, options
         As :func:`reconstruct` takes them.
 
     Raises
@@ -146,8 +151,11 @@ def reconstruct_into(
     """
     if method not in METHODS:
         raise InputError(f"method: found {method!r}, expected one of {METHODS}")
-    if align and motion is not None:
-        raise InputError("motion and align: found both, expected one of them")
+    if align + (motion is not None) + (alignment is not None) > 1:
+        raise InputError("motion, alignment and align: found more than one, expected one of them")
+    if alignment is not None:
+        motion = alignment.motion
+        valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
         valid_views = believed_views(valid_views, scan.views)
     iterative.sorted_options(method, options)  # refuses what is wrong before the long work
@@ -168,7 +176,7 @@ def reconstruct_into(
     if align and method != "imgr":
         aligned = align_scan(scan, device=devices[0], progress=progress, **limits)
         motion = aligned.motion
-        valid_views = all_but(aligned.flagged, scan.views)
+        valid_views = aligned.valid_views
     if fitted is not None:
         _warn_of_gaps(fitted, grid, scan.views if valid_views is None else int(valid_views.sum()))
     notes = []

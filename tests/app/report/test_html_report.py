@@ -5,12 +5,12 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from clra.app.records import Record
 from clra.app.report.comparison import Comparison, MatchedView, Pair
 from clra.app.report.html_report import render, write_report
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
 from clra.methods.alignment.quality import Quality
+from clra.methods.alignment.result import AlignmentResult
 from clra.model.motion import Motion
 
 
@@ -88,7 +88,7 @@ def test_the_page_tells_all_there_is(page, record):
         "2 of 24 views flagged",
         "1QR-1HR",
         "a device",
-        record.about["checksum"],
+        record.checksum,
         "space-filling",
         "4.00 times",  # doubled pictures have four times the squared gradient
         "clra 0.",
@@ -114,7 +114,7 @@ def test_the_same_report_twice_is_the_same_page(page, record, scan, comparison):
 
 
 def test_a_motion_alone_makes_a_page(tmp_path):
-    bare = Record(Motion.identity(5), np.ones(5))
+    bare = AlignmentResult.from_motion(Motion.identity(5))
     write_report(tmp_path / "r.html", Findings(bare))
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "--scan SCAN" in page and "Convergence" not in page and "Warnings" not in page

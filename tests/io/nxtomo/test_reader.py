@@ -319,3 +319,34 @@ def test_interrupted_writing_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_nxtomo(tmp_path / "scan.nxs", Interrupted(), TRAJECTORIES["circular"])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("rotation", ["ccw", "cw"])
+def test_python_reads_the_same_frames_with_the_same_words(
+    nxtomo_file: Builder, rotation: str
+) -> None:
+    def square(entry: h5py.Group) -> None:
+        put(entry, "instrument/detector/y_pixel_size", 0.05, "mm")
+
+    read = read_scan(nxtomo_file(square), rotation=rotation).geometry
+    made = circular(
+        VIEWS,
+        source_to_axis=200.0,
+        source_to_detector=500.0,
+        pixel_size=0.05,
+        shape=(ROWS, COLUMNS),
+        start=np.radians(10.0 * np.flatnonzero(ROLES == 0)[0]),
+        arc=np.radians(10.0 * VIEWS),
+        rotation=rotation,
+        row0="top",
+    )
+    np.testing.assert_allclose(made.to_astra(), read.to_astra(), rtol=0, atol=1e-9)
+
+
+def test_a_written_scan_keeps_the_words(tmp_path: Path) -> None:
+    geometry = helix(7, angle_step=0.3, z_step=0.1, rotation="ccw", row0="top", **DETECTOR)
+    frames = np.random.default_rng(0).random((7, 5, 6)).astype(np.float32)
+    write_scan(tmp_path / "scan.nx", Scan(frames, geometry))
+    read = read_scan(tmp_path / "scan.nx")
+    np.testing.assert_allclose(read.geometry.to_astra(), geometry.to_astra(), rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(read.read(0, 7), frames)
