@@ -26,9 +26,9 @@ class RigidMotion:
     """How the sample moved in each view, in the axes of that view's detector.
 
     The axes are those of u, of v and of the detector's normal, which points away from the source;
-    the origin is the point of the ray to the detector's centre that lies at the depth of the
-    rotation axis. A point of the sample that the ideal geometry has at X in these axes lies at
-    ``Exp(rotation) X + translation``. Detectors whose rows and columns are not perpendicular are
+    the origin is the point at the depth of the rotation axis on the perpendicular from the source
+    to the detector, whichever part of the detector is used. A point of the sample that the ideal
+    geometry has at X in these axes lies at ``Exp(rotation) X + translation``. Detectors whose rows and columns are not perpendicular are
     refused where a geometry absorbs the motion.
 
     Parameters
@@ -82,6 +82,7 @@ class RigidMotion:
         pixel = np.stack([np.linalg.norm(a, axis=1) for a in (geometry.u, geometry.v)], axis=1)
         depth = near / motion.magnification  # what is nearer to the source appears larger
         shifts = np.stack([motion.shift_u, motion.shift_v], axis=1)
+        shifts -= _about_centre(geometry, motion.magnification)
         table = np.zeros((motion.views, 6))
         table[:, :2] = shifts * pixel * (depth / far)[:, None]
         table[:, 2] = depth - near
@@ -143,6 +144,10 @@ class RigidMotion:
         moved = -np.einsum("nij,nj->ni", back, self.translation)
         return RigidMotion(translation=moved, rotation=-self.rotation)
 
+    def about(self, offset_u: float, offset_v: float) -> RigidMotion:
+        """Return the same motion, which no window of the detector changes, see `Motion.about`."""
+        return self
+
     def subset(self, index: ArrayLike) -> RigidMotion:
         """Return the motion of some views."""
         chosen = np.asarray(index)
@@ -157,8 +162,10 @@ class RigidMotion:
         near, far = geometry.source_to_axis, geometry.source_to_detector
         table = self.table
         depth = near + table[:, 2]
+        aside = _about_centre(geometry, near / depth)
         for k, step in enumerate((geometry.u, geometry.v)):
             table[:, k] *= far / depth / np.linalg.norm(step, axis=1)
+            table[:, k] += aside[:, k]
         table[:, 2] = near / depth - 1
         table[:, 3:] = np.degrees(table[:, 3:])
         return table
@@ -173,9 +180,7 @@ def absorb(geometry: ConeBeamGeometry, motion: RigidMotion) -> dict[str, Floats]
     if motion.views != geometry.views:
         raise InputError(f"motion: found {motion.views} views, expected {geometry.views}")
     axes = view_axes(geometry)
-    near, far = geometry.source_to_axis, geometry.source_to_detector
-    ray = geometry.detector - geometry.source
-    centre = geometry.source + ray * (near / far)[:, None]
+    centre = turning_centre(geometry)
     moved = np.einsum("nij,nj->ni", axes, motion.translation)
     back = rotation_matrices(-np.einsum("nij,nj->ni", turning_axes(axes), motion.rotation))
 
@@ -188,6 +193,17 @@ def absorb(geometry: ConeBeamGeometry, motion: RigidMotion) -> dict[str, Floats]
         "u": turned(geometry.u),
         "v": turned(geometry.v),
     }
+
+
+def turning_centre(geometry: ConeBeamGeometry) -> Floats:
+    """Return the origin of each view's axes, (views, 3) [mm]."""
+    return np.asarray(geometry.source + geometry.normal * geometry.source_to_axis[:, None])
+
+
+def _about_centre(geometry: ConeBeamGeometry, magnification: Floats) -> Floats:
+    """Shift with which magnifying about the principal point is magnifying about the centre."""
+    centre = np.array([geometry.columns - 1, geometry.rows - 1]) / 2
+    return np.asarray((1 - magnification)[:, None] * (geometry.principal - centre))
 
 
 def view_axes(geometry: ConeBeamGeometry) -> Floats:

@@ -37,8 +37,7 @@ def random_motion(views=7, seed=0):
 def moved(points, motion, of, view):
     """Points as the sample had them in a view: turned about the centre, then shifted."""
     axes = view_axes(of)[view]
-    ratio = of.source_to_axis[view] / of.source_to_detector[view]
-    centre = of.source[view] + ratio * (of.detector[view] - of.source[view])
+    centre = of.source[view] + of.source_to_axis[view] * of.normal[view]
     seen = (points - centre) @ axes
     turn = Rotation.from_rotvec(motion.rotation[view].copy()).as_matrix()
     return (seen @ turn.T + motion.translation[view]) @ axes.T + centre
@@ -56,8 +55,7 @@ def test_absorbed_motion_projects_like_moved_points():
 def test_motions_follow_each_other_in_the_axes_of_the_view():
     of, first, second = geometry(), random_motion(seed=2), random_motion(seed=3)
     points = np.random.default_rng(1).uniform(-3, 3, (5, 3))
-    ratio = (of.source_to_axis / of.source_to_detector)[:, None]
-    centre = of.source + ratio * (of.detector - of.source)
+    centre = of.source + of.source_to_axis[:, None] * of.normal
     together = of.with_motion(first.then(second)).project(points)
     for view, axes in enumerate(view_axes(of)):
         seen = (points - centre[view]) @ axes
@@ -74,8 +72,10 @@ def test_the_inverse_undoes_a_motion():
     assert np.allclose(back.to_astra(), of.to_astra(), atol=1e-12)
 
 
-def test_translations_of_shifts_show_the_shifts_at_the_axis():
+@pytest.mark.parametrize("aside", [(0.0, 0.0), (11.0, -6.0)])
+def test_translations_of_shifts_show_the_shifts_at_the_axis(aside):
     of = circular(9, source_to_axis=40.0, source_to_detector=100.0, pixel_size=0.2, shape=(31, 45))
+    of = of.with_motion(Motion(shift_u=np.full(9, aside[0]), shift_v=np.full(9, aside[1])))
     random = np.random.default_rng(4)
     shifts = Motion(
         shift_u=random.uniform(-2, 2, 9),

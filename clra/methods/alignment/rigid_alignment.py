@@ -1,7 +1,8 @@
 """Alignment by rigid motion of the sample: translations and rotations of each view.
 
-The shifts of Algorithms 1 and 2 come first: they are most of what shows. Then the same iteration goes
-on with up to six parameters a view, solved for together from the derivatives of the re-projection.
+The shifts of Algorithms 1 and 2 come first: they are most of what shows. Then the same iteration
+goes on with up to six parameters a view, which are solved for together from the derivatives of the
+re-projection.
 """
 
 import time
@@ -116,9 +117,7 @@ class RigidAlignment:
             before = self.motion
             self.motion = self.motion.then(RigidMotion.from_table(table))
             if self.anchor:
-                self.motion = without_rigid_gauge(
-                    self.motion, self.scan.geometry, self.points
-                )
+                self.motion = without_rigid_gauge(self.motion, self.scan.geometry, self.points)
             self.last = step
             moved = self.motion.in_pixels(self.scan.geometry) - before.in_pixels(self.scan.geometry)
             self.history.append(
@@ -148,13 +147,9 @@ class RigidAlignment:
             motion=self.motion,
             valid_views=valid,
             confidence=np.clip(np.where(valid, self.last.correlation, 0.0), 0.0, 1.0),
-            sigma=self._sigma(),
+            sigma=self.last.sigma,
             history=tuple(self.history),
             gauge=self.start.gauge,
             schedule=self.start.schedule,
             device=self.start.device,
         )
-
-    def _sigma(self) -> Floats:
-        """Standard errors in mm and rad, as the motion is."""
-        return self.last.sigma

@@ -26,9 +26,8 @@ from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
 
-# Sigmas of the band-pass [pixel of the level]: the narrowest that splines allow, for rotations move
-# fine structure far from the axis; up to 4 instead of 8 pixels the rotations are a quarter better on
-# circles, and no better on truncated scans.
+# Sigmas of the band-pass [pixel of the level]: the narrowest that splines allow, for rotations
+# move fine structure far from the axis.
 _BAND = (0.7, 8.0)
 
 

@@ -10,6 +10,7 @@ from clra.model.rigid_motion import (
     RigidMotion,
     rotation_matrices,
     rotation_vectors,
+    turning_centre,
     view_axes,
 )
 
@@ -28,8 +29,7 @@ def between(nominal: ConeBeamGeometry, moved: ConeBeamGeometry) -> RigidMotion:
         Distances and pixels agree; only poses differ.
     """
     axes, turned = view_axes(nominal), view_axes(moved)
-    near, far = nominal.source_to_axis, nominal.source_to_detector
-    centre = nominal.source + (nominal.detector - nominal.source) * (near / far)[:, None]
+    centre = turning_centre(nominal)
     in_axes = np.swapaxes(turned, 1, 2) @ axes
     seen = np.einsum("nji,nj->ni", axes, nominal.source - centre)
     apart = np.einsum("nji,nj->ni", axes, moved.source - centre)

@@ -211,7 +211,7 @@ def rigid_table(geometry: ConeBeamGeometry) -> NDArray[np.float32]:
     to_centre = geometry.detector - geometry.source
     u, v = geometry.u, geometry.v
     dual_u, dual_v = (a / np.sum(a**2, axis=1, keepdims=True) for a in (u, v))
-    centre_from_source = to_centre * (near / far)[:, None]
+    centre_from_source = geometry.normal * near[:, None]
 
     def dot(a: Floats, b: Floats) -> Floats:
         return np.asarray(np.sum(a * b, axis=1))
