@@ -20,10 +20,14 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.io.alignment_file import write_alignment as write_alignment
     from clra.io.scan_files import read_scan as read_scan
     from clra.io.scan_files import write_scan as write_scan
+    from clra.io.scanners.recognise import read_start_motion as read_start_motion
+    from clra.io.scanners.scanner_options import ScannerOptions as ScannerOptions
     from clra.io.volumes.volume_files import write_volume as write_volume
     from clra.methods.alignment.align import align as align
     from clra.methods.alignment.result import AlignmentResult as AlignmentResult
     from clra.methods.correction import correct as correct
+    from clra.methods.reconstruction.iterative import Multigrid as Multigrid
+    from clra.methods.reconstruction.osem_tr import OrderedSubsets as OrderedSubsets
     from clra.methods.reconstruction.reconstruct import reconstruct as reconstruct
     from clra.model.geometry import ConeBeamGeometry as ConeBeamGeometry
     from clra.model.grid import VolumeGrid as VolumeGrid
@@ -51,12 +55,16 @@ _HOMES = {
     "Scan": "clra.model.scan",
     "read_scan": "clra.io.scan_files",
     "write_scan": "clra.io.scan_files",
+    "ScannerOptions": "clra.io.scanners.scanner_options",
+    "read_start_motion": "clra.io.scanners.recognise",
     "read_alignment": "clra.io.alignment_file",
     "write_alignment": "clra.io.alignment_file",
     "write_volume": "clra.io.volumes.volume_files",
     "align": "clra.methods.alignment.align",
     "AlignmentResult": "clra.methods.alignment.result",
     "reconstruct": "clra.methods.reconstruction.reconstruct",
+    "OrderedSubsets": "clra.methods.reconstruction.osem_tr",
+    "Multigrid": "clra.methods.reconstruction.iterative",
     "correct": "clra.methods.correction",
     "devices": "clra.ops.runtime.devices",
     "ForwardProjector": "clra.ops.projection.projector",
@@ -79,9 +87,12 @@ def __getattr__(name: str) -> Any:
     if name == "kernels":
         return import_module("clra.kernels")
     if name == "__version__":
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        return version("clra")
+        try:
+            return version("clra")
+        except PackageNotFoundError:
+            return "unknown"  # run from a checkout that is not installed
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'clra' has no attribute {name!r}")

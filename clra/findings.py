@@ -69,6 +69,11 @@ class Finding:
         return self
 
 
+def warn(code: str, message: str, advice: str = "") -> None:
+    """Issue a finding of severity "warning"; see :class:`Finding`."""
+    Finding(code, message, advice).warn()
+
+
 @contextmanager
 def collected() -> Iterator[list[Finding]]:
     """Yield a list to which every finding that is issued within the block is appended, once."""
@@ -78,6 +83,12 @@ def collected() -> Iterator[list[Finding]]:
         yield findings
     finally:
         _COLLECTING.reset(token)
+
+
+def collected_so_far(*, outermost: bool = False) -> tuple[Finding, ...]:
+    """Return the findings that the innermost, or the outermost, :func:`collected` has by now."""
+    lists = _COLLECTING.get()
+    return tuple(lists[0 if outermost else -1]) if lists else ()
 
 
 _LOG = logging.getLogger(__name__)

@@ -19,7 +19,7 @@
 // Means over blocks of factor x factor pixels of the masked image, RIM blocks of zeros around them:
 // there the plane is continued, so that splines between blocks reach the borders. Pixels of an
 // incomplete last block are left out, as their centre is not the block's.
-kernel void block_means(
+kernel required_group void block_means(
     global float *restrict means, // lined (views, coarse_rows, coarse_stride)
     const ulong means_offset,
     global const float *restrict image, // (views, rows, columns)
@@ -55,7 +55,7 @@ kernel void block_means(
 }
 
 // Vertical convolutions of the block means with H(k) and k H(k), k in blocks.
-kernel void wide_rows(
+kernel required_group void wide_rows(
     global float *restrict zeroth, // lined (views, rows, stride), rows and columns of blocks
     const ulong zeroth_offset,
     global float *restrict first, // likewise
@@ -89,7 +89,7 @@ kernel void wide_rows(
 }
 
 // The fitted plane's value: a combination, known in advance, of the image's weighted moments.
-kernel void wide_columns(
+kernel required_group void wide_columns(
     global float *restrict wide, // lined (views, rows, stride), rows and columns of blocks
     const ulong wide_offset,
     global const float *restrict zeroth, // lined (views, rows, stride), as from wide_rows
@@ -134,7 +134,7 @@ kernel void wide_columns(
 
 // Cubic B-spline through coarse columns, at every fine column, in the coarse rows. LANES columns
 // lean on `span` coarse ones, whose weights are known in advance.
-kernel void expand_columns(
+kernel required_group void expand_columns(
     global float *restrict expanded, // lined (views, coarse_rows, stride)
     const ulong expanded_offset,
     global const float *restrict coarse, // lined (views, coarse_rows, coarse_stride)
@@ -167,7 +167,7 @@ kernel void expand_columns(
 }
 
 // Vertical convolution of the masked image with h; what lies beyond the first and last row is 0.
-kernel void narrow_rows(
+kernel required_group void narrow_rows(
     global float *restrict blurred, // lined (views, rows, stride)
     const ulong blurred_offset,
     global const float *restrict image, // (views, rows, columns)
@@ -205,7 +205,7 @@ kernel void narrow_rows(
 
 // Horizontal convolution with h, times the reciprocal of the mask's, minus the wide part, brought
 // back from its rows.
-kernel void bandpass_columns(
+kernel required_group void bandpass_columns(
     global float *restrict coefficients, // lined (views, rows, stride)
     const ulong coefficients_offset,
     global const float *restrict image, // lined (views, rows, stride), blurred along rows
@@ -257,7 +257,7 @@ kernel void bandpass_columns(
 }
 
 // The band-passed image itself: the spline at the pixels; the border goes on outside.
-kernel void spline_values(
+kernel required_group void spline_values(
     global float *restrict values, // (views, rows, values_stride), lines from values_lead on
     const ulong values_offset,
     global const float *restrict coefficients, // lined (views, rows, stride)

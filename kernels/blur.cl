@@ -7,7 +7,7 @@
 #include "vectors.clh"
 
 // Along the direction of rows (vertical).
-kernel void blur_rows(
+kernel required_group void blur_rows(
     global float *restrict blurred, // lined (views, rows, stride)
     const ulong blurred_offset,
     global const float *restrict image, // lined (views, rows, stride)
@@ -37,7 +37,7 @@ kernel void blur_rows(
 }
 
 // Along the direction of columns (horizontal); radius <= MARGIN.
-kernel void blur_columns(
+kernel required_group void blur_columns(
     global float *restrict blurred, // lined (views, rows, stride)
     const ulong blurred_offset,
     global const float *restrict image, // lined (views, rows, stride)

@@ -2,14 +2,18 @@
 //
 // W(x) = sum over views of the view's weight times that of the row that x falls on, linear between
 // rows, 0 for a view on whose detector [0, columns - 1] x [0, rows - 1] the projection does not
-// lie. It varies over many voxels, so that it is computed once for a block of them, in its middle,
-// and interpolated linearly. The last block of an axis may be cut short by the grid's end: its
-// middle is `last` in units of whole blocks, at most their number less 1.
+// lie. Where rays have weights, W(x) is the part that such a sum is of the one without row weights
+// and without top and bottom of the detector. It varies over many voxels, so that it is computed
+// once for a block of them, in its middle, and interpolated linearly. The last block of an axis may
+// be cut short by the grid's end: its middle is `last` in units of whole blocks, at most their
+// number less 1.
 //
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
 // normalise one a voxel, along the volume's axes from last to first.
 
-kernel void coverage(
+#include "group.clh"
+
+kernel required_group void coverage(
     global float *restrict seen, // W, (ny, nx, nz) of the coarse grid
     const ulong seen_offset,
     global const float *restrict matrices, // (views, 12), from coarse (i, j, k, 1) to (a, b, g)
@@ -18,6 +22,8 @@ kernel void coverage(
     const ulong view_weight_offset,
     global const float *restrict row_weight, // (rows)
     const ulong row_weight_offset,
+    global const float *restrict ray_weight, // (views, samples), evenly along the columns
+    const ulong ray_weight_offset,
     const int nx, // coarse voxels
     const int ny,
     const int nz,
@@ -26,17 +32,19 @@ kernel void coverage(
     const float last_z,
     const int columns, // pixels; at least 2, as are rows
     const int rows,
-    const int views)
+    const int views,
+    const int samples) // at least 2; 0 where rays have no weights
 {
     seen += seen_offset;
     matrices += matrices_offset;
     view_weight += view_weight_offset;
     row_weight += row_weight_offset;
+    ray_weight += ray_weight_offset;
     const int k = get_global_id(0), i = get_global_id(1), j = get_global_id(2);
     if (k >= nz || i >= nx || j >= ny)
         return;
     const float x = min((float)i, last_x), y = min((float)j, last_y), z = min((float)k, last_z);
-    float sum = 0.0f;
+    float sum = 0.0f, needed = 0.0f;
     for (int view = 0; view < views; ++view) {
         global const float *m = matrices + 12 * view;
         const float a = m[0] * x + m[1] * y + m[2] * z + m[3];
@@ -44,14 +52,23 @@ kernel void coverage(
         const float g = m[8] * x + m[9] * y + m[10] * z + m[11];
         const float column = a / g, row = b / g;
         // Written so that a NaN is not on the detector.
-        const int on = g > 0.0f && column >= 0.0f && column <= columns - 1.0f && row >= 0.0f &&
-                       row <= rows - 1.0f;
+        const int beside = g > 0.0f && column >= 0.0f && column <= columns - 1.0f;
+        const int on = beside && row >= 0.0f && row <= rows - 1.0f;
         const int r = on ? min((int)row, rows - 2) : 0;
         const float f = row - r;
         const float weight = row_weight[r] + f * (row_weight[r + 1] - row_weight[r]);
-        sum += on ? view_weight[view] * weight : 0.0f;
+        float ray = view_weight[view];
+        if (samples) {
+            const float at = beside ? column * ((samples - 1) / (columns - 1.0f)) : 0.0f;
+            const int c = min((int)at, samples - 2);
+            global const float *t = ray_weight + (size_t)view * samples + c;
+            ray *= t[0] + (at - c) * (t[1] - t[0]);
+        }
+        needed += beside ? ray : 0.0f;
+        sum += on ? ray * weight : 0.0f;
     }
-    seen[((size_t)j * nx + i) * nz + k] = sum;
+    const float part = needed > 0.0f ? sum / needed : 0.0f;
+    seen[((size_t)j * nx + i) * nz + k] = samples ? part : sum;
 }
 
 // Where a voxel lies between the middles of coarse ones: index of the lower, and how far on; beyond
@@ -65,7 +82,7 @@ static inline int between(
     return low;
 }
 
-kernel void normalise(
+kernel required_group void normalise(
     global float *restrict volume, // (ny, nx, nz), or (nz, ny, nx) if slices is set
     const ulong volume_offset,
     global const float *restrict seen, // W, (coarse_y, coarse_x, coarse_z)
@@ -87,6 +104,7 @@ kernel void normalise(
     const float radius, // of the field of view, voxels
     const float least, // a voxel with less W is set to 0
     const float scale,
+    const float lowest, // smaller values are raised to it
     const int slices)
 {
     volume += volume_offset;
@@ -111,5 +129,5 @@ kernel void normalise(
     const float dx = i - axis_x, dy = j - axis_y;
     const size_t at = slices ? ((size_t)k * ny + j) * nx + i : ((size_t)j * nx + i) * nz + k;
     const int good = sum > least && dx * dx + dy * dy <= radius * radius;
-    volume[at] = good ? volume[at] * scale / sum : 0.0f;
+    volume[at] = good ? max(volume[at] * scale / sum, lowest) : 0.0f;
 }

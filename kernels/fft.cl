@@ -10,6 +10,8 @@
 // (items, rows, width) with width = columns/2 for even columns, else columns. Each work-item makes
 // one complex element; global sizes are (width or columns/2 + 1, rows, items), rounded up at will.
 
+#include "group.clh"
+
 static inline float2 conjugate(const float2 a) { return (float2)(a.x, -a.y); }
 
 static inline float2 product(const float2 a, const float2 b)
@@ -20,7 +22,7 @@ static inline float2 product(const float2 a, const float2 b)
 // exp(i pi a), a in [-1, 1]
 static inline float2 unit(const float a) { return (float2)(cospi(a), sinpi(a)); }
 
-kernel void real_to_work(
+kernel required_group void real_to_work(
     global float2 *restrict work, // complex lines to be transformed
     const ulong work_offset,
     global const float *restrict image, // real lines
@@ -39,7 +41,7 @@ kernel void real_to_work(
     work[i] = paired ? vload2(i, image) : (float2)(image[i], 0.0f);
 }
 
-kernel void work_to_real(
+kernel required_group void work_to_real(
     global float *restrict image, // real lines
     const ulong image_offset,
     global const float2 *restrict work, // complex lines, transformed back
@@ -62,7 +64,7 @@ kernel void work_to_real(
 }
 
 // Global size (columns/2 + 1, rows, items).
-kernel void work_to_spectrum(
+kernel required_group void work_to_spectrum(
     global float2 *restrict spectrum, // half spectrum
     const ulong spectrum_offset,
     global const float2 *restrict work, // transform of the complex lines
@@ -94,7 +96,7 @@ kernel void work_to_spectrum(
 }
 
 // Global size (width, rows, items).
-kernel void spectrum_to_work(
+kernel required_group void spectrum_to_work(
     global float2 *restrict work, // to be transformed back
     const ulong work_offset,
     global const float2 *restrict spectrum, // half spectrum of a real image
@@ -129,7 +131,7 @@ kernel void spectrum_to_work(
 
 // spectrum *= multiplier, for every item, and for every row where rows were not transformed.
 // Global size (columns/2 + 1, rows, items).
-kernel void multiply_spectrum(
+kernel required_group void multiply_spectrum(
     global float2 *restrict spectrum, // half spectrum
     const ulong spectrum_offset,
     global const float *restrict multiplier, // (rows or 1, columns/2 + 1, parts)

@@ -17,7 +17,7 @@
 // Start of every view: the coarse shift or none; views without signal are done at once.
 // One work-item a view. Level: the largest of the wide image on a grid of up to 16 x 16 points; a
 // signal weaker than 1e-5 of it is rounding, NaN and infinity make the level NaN.
-kernel void start(
+kernel required_group void start(
     global float *restrict state, // (views, STATE)
     const ulong state_offset,
     global float *restrict estimates, // (views, FIELDS)
@@ -75,7 +75,7 @@ kernel void start(
 
 // Judge where a view stands, keep it if it is the best so far, and go on: a Gauss-Newton step from
 // the best, or half-way back to it. One work-item a view; estimates are those of the best.
-kernel void advance(
+kernel required_group void advance(
     global float *restrict state, // (views, STATE)
     const ulong state_offset,
     global float *restrict estimates, // (views, FIELDS)

@@ -18,19 +18,6 @@
 #define SPLINE_SLOPE(f, e)                                                                         \
     {-0.5f * (e) * (e), (f) * (1.5f * (f) - 2.0f), (e) * (2.0f - 1.5f * (e)), 0.5f * (f) * (f)}
 
-// weight of one coefficient, `x` past which the point lies, and its derivative
-static inline float spline_weight(const float x, float *slope)
-{
-    const float away = fabs(x), rest = fmax(2.0f - away, 0.0f);
-    const float decline = away < 1.0f ? away * (2.0f - 1.5f * away) : 0.5f * rest * rest;
-    *slope = x < 0.0f ? decline : -decline;
-    return away < 1.0f ? (2.0f / 3.0f) - away * away * (1.0f - 0.5f * away)
-                       : rest * rest * rest * (1.0f / 6.0f);
-}
-
-// sums that one of several work-items makes
-#define MINE ((SUMS + GROUP - 1) / GROUP)
-
 // A view's images and where it stands.
 typedef struct {
     global const float *coefficients; // lined (rows, stride): of B
@@ -46,16 +33,17 @@ typedef struct {
 
 // The spline and its derivatives along x and y, u and f past the second of four by four
 // coefficients, whose first are those of column x - 1 and row y - 1.
-__attribute__((always_inline)) static inline void
+inlined void
 spline_at(const counterparts s, const int x, const int y, const real u, const float f, real *b,
           real *p, real *q)
 {
     *b = *p = *q = 0.0f;
-#if GROUP == 1
     const float wy[4] = SPLINE(f, 1.0f - f), sy[4] = SPLINE_SLOPE(f, 1.0f - f);
     const real wx[4] = SPLINE(u, 1.0f - u), sx[4] = SPLINE_SLOPE(u, 1.0f - u);
+#pragma unroll
     for (int k = 0; k < 4; ++k) {
         real value = 0.0f, slope = 0.0f;
+#pragma unroll
         for (int l = 0; l < 4; ++l) {
             const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
             const real c = load_global(s.coefficients + line + k);
@@ -66,31 +54,13 @@ spline_at(const counterparts s, const int x, const int y, const real u, const fl
         *p += sx[k] * value;
         *q += wx[k] * slope;
     }
-#else // one weight after the other: sixteen would take a GPU's registers
-#pragma unroll 1
-    for (int k = 0; k < 4; ++k) {
-        float value = 0.0f, slope = 0.0f, weight, decline;
-#pragma unroll 1
-        for (int l = 0; l < 4; ++l) {
-            const int line = clamp(y - 1 + l, 0, s.rows - 1) * s.stride + (MARGIN + x - 1);
-            const float c = s.coefficients[line + k];
-            weight = spline_weight(f - (l - 1), &decline);
-            value += weight * c;
-            slope += decline * c;
-        }
-        weight = spline_weight(u - (k - 1), &decline);
-        *b += weight * value;
-        *p += decline * value;
-        *q += weight * slope;
-    }
-#endif
 }
 
 // The terms of LANES pixels from (j, i) on; returns w. Each group of LANES columns takes the
 // spline's piece under its middle: in the outer ones the point lies up to LANES/2 |1/m - 1| beyond
 // the knot, where the piece differs from its neighbour by the cube of that only. So no lane loads
 // from an address of its own.
-__attribute__((always_inline)) static inline real
+inlined real
 terms_at(const counterparts s, const int j, const int i, real term[TERMS])
 {
     const float2 centre = 0.5f * (float2)(s.columns - 1, s.rows - 1);
@@ -121,9 +91,8 @@ terms_at(const counterparts s, const int j, const int i, real term[TERMS])
 }
 
 // Sums of the normal equations over blocks of rows. Work-group (GROUP, 1, 1), global size
-// (GROUP, blocks, views). On a CPU a work-item keeps all sums in its registers. A GPU's would not
-// hold them: there each work-item makes the terms of one pixel, and when all are there each makes
-// one of the sums.
+// (GROUP, blocks, views). A work-item keeps all sums of its pixels in its registers; those of a
+// group are added at the end.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     global float *restrict sums, // (views, blocks, SUMS)
     const ulong sums_offset,
@@ -169,57 +138,40 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void normal_equations(
     const int start = top + block * block_rows, stop = min(bottom, start + block_rows);
     sums += sums_offset + ((ulong)view * get_global_size(1) + block) * SUMS;
     real term[TERMS];
-#if GROUP == 1
     real sum[SUMS];
+#pragma unroll
     for (int k = 0; k < SUMS; ++k)
         sum[k] = 0.0f;
     for (int j = start; j < stop; ++j)
-        for (int i = left; i < right; i += LANES) {
+        for (int i = left + get_local_id(0) * LANES; i < right; i += GROUP * LANES) {
             const real w = terms_at(s, j, i, term);
+#pragma unroll
             for (int k = 0; k < BLURS; ++k)
                 term[5 + k] = load_global(s.measured + k * s.blur + j * stride + MARGIN + i);
-            for (int k = 0, at = 0; k < TERMS; ++k) {
+#pragma unroll
+            for (int k = 0; k < TERMS; ++k) {
                 const real weighted = w * term[k];
-                for (int other = k; other < TERMS; ++other, ++at)
-                    sum[at] += weighted * term[other];
+#pragma unroll
+                for (int other = 0; other < TERMS; ++other)
+                    if (other >= k)
+                        sum[OF(k, other)] += weighted * term[other];
             }
         }
+#if GROUP == 1
     for (int k = 0; k < SUMS; ++k)
         sums[k] = sum_lanes(sum[k]);
 #else
-    local float shared[TERMS * GROUP];
-    const int item = get_local_id(0), width = right - left;
-    // the two terms of each of this work-item's sums, one of 36 or more work-items
-    int one[MINE], other[MINE];
-    float sum[MINE];
-    for (int n = 0; n < MINE; ++n) {
-        one[n] = 0;
-        other[n] = item + n * GROUP;
-        for (; one[n] < TERMS && other[n] >= TERMS - one[n]; ++one[n])
-            other[n] -= TERMS - one[n];
-        other[n] += one[n];
-        sum[n] = 0.0f;
+    local float shared[SUMS][GROUP + 1]; // + 1: the sums lie in different banks
+    const int item = get_local_id(0);
+#pragma unroll
+    for (int k = 0; k < SUMS; ++k)
+        shared[k][item] = sum[k];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int k = item; k < SUMS; k += GROUP) {
+        float total = 0.0f;
+        for (int n = 0; n < GROUP; ++n)
+            total += shared[k][n];
+        sums[k] = total;
     }
-    for (int first = 0; first < (stop - start) * width; first += GROUP) {
-        const int pixel = min(first + item, (stop - start) * width - 1);
-        const int j = start + pixel / width, i = left + pixel % width;
-        const float w = terms_at(s, j, i, term);
-        const float root = first + item == pixel ? sqrt(w) : 0.0f;
-        for (int k = 0; k < 5; ++k)
-            shared[k * GROUP + item] = root * term[k];
-        global const float *blurred = s.measured + (j * stride + MARGIN + i);
-        for (int k = 0; k < BLURS; ++k, blurred += s.blur)
-            shared[(5 + k) * GROUP + item] = root * *blurred;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (int n = 0; n < MINE; ++n)
-            if (one[n] < TERMS)
-#pragma unroll 1
-                for (int k = 0; k < GROUP; ++k)
-                    sum[n] += shared[one[n] * GROUP + k] * shared[other[n] * GROUP + k];
-        barrier(CLK_LOCAL_MEM_FENCE);
-    }
-    for (int n = 0; n < MINE; ++n)
-        if (one[n] < TERMS)
-            sums[item + n * GROUP] = sum[n];
 #endif
 }

@@ -30,7 +30,7 @@ static inline real across_lines(
 
 // out = (d/dlambda + (1 + t_u^2) d/dt_u + t_u t_v d/dt_v) p / sqrt(1 + t_u^2 + t_v^2) in the middle
 // between 2 x 2 x 2 pixels of successive views, rows and columns.
-kernel void differentiate(
+kernel required_group void differentiate(
     global float *restrict out, // (views, height, columns - 1)
     const ulong out_offset,
     global const float *restrict projections, // (views + 1, rows, columns), line integrals
@@ -73,7 +73,7 @@ kernel void differentiate(
 
 // Along filter line n, columns j of the derivative's rows position[2n] + position[2n + 1] j. Beyond
 // the detector's first and last row these go on. Zeros follow up to `padded`.
-kernel void take_lines(
+kernel required_group void take_lines(
     global float *restrict lines, // (views, count, padded)
     const ulong lines_offset,
     global const float *restrict image, // (views, height, width)
@@ -109,7 +109,7 @@ kernel void take_lines(
 
 // From filtered lines back to rows and columns of the detector: out(row, j) is column j of line
 // position(row, j).
-kernel void put_lines(
+kernel required_group void put_lines(
     global float *restrict out, // (views, rows, columns)
     const ulong out_offset,
     global const float *restrict lines, // (views, count, padded)

@@ -6,7 +6,9 @@
 
 // Measured minus simulated radiograph; 0 at masked pixels, and where the simulated one, moved by
 // c + m (q - c) + t to be compared, had to be read beyond its border.
-kernel void residual(
+#include "group.clh"
+
+kernel required_group void residual(
     global float *residual, // (views, rows, columns), line integrals; may be `simulated`
     const ulong residual_offset,
     global const float *restrict measured, // (views, rows, columns), line integrals
@@ -35,7 +37,7 @@ kernel void residual(
 }
 
 // volume <- max(0, volume + step update)
-kernel void correct(
+kernel required_group void correct(
     global float *restrict volume, // (columns, planes), 1/mm
     const ulong volume_offset,
     global const float *restrict update, // (columns, planes), 1/mm
@@ -53,7 +55,7 @@ kernel void correct(
 }
 
 // Some planes of one volume to another.
-kernel void copy_planes(
+kernel required_group void copy_planes(
     global float *restrict target, // (columns, target_planes)
     const ulong target_offset,
     global const float *restrict source, // (columns, source_planes)

@@ -42,7 +42,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void means(
 
 // (image - mean) * window, padded with zeros at the far ends. Global size (out_columns, out_rows,
 // views).
-kernel void windowed(
+kernel required_group void windowed(
     global float *restrict out, // (views, out_rows, out_columns)
     const ulong out_offset,
     global const float *restrict image, // (views, rows, columns)
@@ -75,7 +75,7 @@ kernel void windowed(
 }
 
 // measured := measured * conj(simulated). Global size (count), rounded up at will.
-kernel void cross_power(
+kernel required_group void cross_power(
     global float2 *restrict measured, // spectra, (count,)
     const ulong measured_offset,
     global const float2 *restrict simulated, // spectra, (count,)
@@ -193,7 +193,7 @@ static inline real every_second(global const float *restrict p)
 // Windowed, halved images for the coarse search: the spline midway between four pixels.
 // A work-item makes LANES pixels; beyond the halved image out is filled with 0. Global size (blocks
 // of LANES columns, out_rows, views), rounded up at will.
-kernel void halve(
+kernel required_group void halve(
     global float *restrict halved, // (views, out_rows, out_columns)
     const ulong halved_offset,
     global const float *restrict coefficients, // lined (views, rows, stride)

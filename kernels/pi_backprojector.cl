@@ -1,54 +1,35 @@
 // Back-projection over pi-intervals, for exact helical reconstruction:
 // volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
-// bilinearly at the voxel's projection.
+// bilinearly at the voxel's projection, to zero over one row outside the detector.
 //
 // chi is 1 inside the Tam-Danielsson window, whose borders `window` gives by column, 0 outside. At
 // a border it falls linearly over as much as the projection moves from view to view, so that a
 // voxel's first and last view count by the part of them that belongs to its pi-interval, and one
-// row more, over which p is interpolated.
+// row more, over which p is interpolated. weight shares voxels among helices, see pi_interval.clh.
 //
-// weight shares voxels among helices. Of each, `spans` gives the heights above each (x, y) whose
-// pi-interval it holds; towards their ends its part falls linearly over BLEND voxels. Voxels that
-// no helix holds become 0.
+// The form for GPUs; CPUs run pi_backprojector_columns.cl. v is parallel to z: the voxels of a
+// column share g and the detector column, and row is linear in z. A work-item sums VOXELS voxels
+// along z, neighbouring ones are neighbours along x.
 //
-// v is parallel to z: the voxels of a column share g and the detector column, and row is linear in
-// z. A work-item sums BLOCK voxels along z over the given views. Global sizes are
-// (blocks, strip, ny ceil(nx / strip)), rounded up at will.
+// Global size (nx, ny, ceil((top - bottom) / VOXELS)), rounded up at will.
 
-#ifndef LANES
-#define LANES 1 // 1, 8 or 16
+#include "gpu.clh"
+#include "pi_interval.clh"
+
+#ifndef VOXELS
+#define VOXELS 8
+#endif
+#ifndef INSIDE
+#define INSIDE 0 // 1 leaves the way with tests out, to count instructions
 #endif
 
-#include "pieces.clh"
-
-#ifndef BLOCK
-#define BLOCK (LANES == 1 ? 1 : 32 * LANES) // whole LANES
-#endif
-
-// At 0 a seam between helices shows the noise's change; more than a few voxels change nothing.
-#define BLEND 8.0f
-
-// Part of one helix at height z. `span` is the first and the last voxel that it holds.
-static inline float part(global const float *span, const float z)
-{
-    return clamp(SMALLER(z - span[0], span[1] - z) * (1.0f / BLEND), 0.0f, 1.0f);
-}
-
-// 0 to 1: how far inside the window, whose borders are softened by a half width of 1 / (2
-// per_width)
-static inline real inside(const real row, const float low, const float high, const float per_width)
-{
-    const real from_low = clamp((row - low) * per_width + 0.5f, (real)(0.0f), (real)(1.0f));
-    return from_low * clamp((high - row) * per_width + 0.5f, (real)(0.0f), (real)(1.0f));
-}
-
-kernel void pi_backproject(
+kernel required_group void pi_backproject(
     global float *restrict volume, // (ny, nx, nz), added to
     const ulong volume_offset,
-    global const float *restrict projections, // (count, columns + 1, pitch), padded
+    global const float *restrict projections, // (count, rows, columns)
     const ulong projections_offset,
     global const float *restrict views, // (count, VIEW_FLOATS)
-    const ulong views_offset,
+    const ulong views_offset, // a multiple of 4
     global const float *restrict window, // (columns + 1, 2) lower and upper border [row]
     const ulong window_offset,
     global const float *restrict spans, // (helices, ny, nx, 2) [voxel]
@@ -58,98 +39,98 @@ kernel void pi_backproject(
     const int nz,
     const int columns, // pixels
     const int rows,
-    const int pitch, // elements of a padded line
     const int count, // views
     const int helices,
     const int helix, // that the views are of
     const int bottom, // first voxel along z to treat
     const int top, // behind the last voxel to treat
-    const int strip, // columns of voxels along x that are treated for all y before others are
     const float z_step) // of the source from view to view, positive [voxel]
 {
     volume += volume_offset;
-    projections += projections_offset + PAD;
+    projections += projections_offset;
     views += views_offset;
     window += window_offset;
-    spans += spans_offset;
-    const int z = bottom + get_global_id(0) * BLOCK;
-    const int x = get_global_id(1) + get_global_id(2) / ny * strip;
-    const int y = get_global_id(2) % ny;
-    if (z >= top || (int)get_global_id(1) >= strip || x >= nx)
+    const int x = get_global_id(0), y = get_global_id(1);
+    const int z = bottom + get_global_id(2) * VOXELS;
+    if (x >= nx || y >= ny || z >= top)
         return;
-    const int voxels = min(BLOCK, top - z);
-    const size_t column_of_voxels = (size_t)y * nx + x;
-    const size_t of_helix = (size_t)2 * nx * ny;
-    global const float *own = spans + helix * of_helix + 2 * column_of_voxels;
+    const size_t line = (size_t)y * nx + x, of_helix = (size_t)2 * nx * ny;
+    spans += spans_offset + 2 * line;
+    global const float *own = spans + helix * of_helix;
+    const int voxels = min(VOXELS, top - z);
     if (own[1] <= z || own[0] >= z + voxels - 1)
         return;
-
-    float sum[BLOCK];
-    for (int k = 0; k < BLOCK; ++k)
+    const float fx = x, fy = y, fz = z, last_row = rows - 1.0f;
+    float sum[VOXELS];
+#pragma unroll
+    for (int k = 0; k < VOXELS; ++k)
         sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
-        global const float *m = views + view * VIEW_FLOATS;
-        const float g = fma(m[8], (float)x, fma(m[9], (float)y, m[11]));
-        const float scale = 1.0f / g;
-        const float column = fma(m[0], (float)x, fma(m[1], (float)y, m[3])) * scale;
+        global const float4 *m = (global const float4 *)(views + view * VIEW_FLOATS);
+        const float4 pa = m[0], pb = m[1], pg = m[2]; // pa.z == pg.z == 0
+        const float scale = reciprocal(fma(pg.x, fx, fma(pg.y, fy, pg.w)));
+        const float column = fma(pa.x, fx, fma(pa.y, fy, pa.w)) * scale;
         if (!(column >= 0.0f && column <= columns - 1.0f))
             continue;
-        const float row =
-            fma(m[4], (float)x, fma(m[5], (float)y, fma(m[6], (float)z, m[7]))) * scale;
-        const float slope = m[6] * scale;
+        const float slope = pb.z * scale;
+        const float row0 = fma(pb.x, fx, fma(pb.y, fy, fma(pb.z, fz, pb.w))) * scale;
+        const float row9 = fma(slope, (float)(VOXELS - 1), row0);
+        const float first = SMALLER(row0, row9), last = LARGER(row0, row9);
         const int c = (int)column;
-        const float f = column - c;
+        const float h = column - c;
         global const float *border = window + 2 * c;
-        const float low = fma(f, border[2] - border[0], border[0]);
-        const float high = fma(f, border[3] - border[1], border[1]);
-        const float half_width = 0.5f + 0.5f * fabs(slope) * z_step;
-        const float per_width = 0.5f / half_width;
-        const float per_row = 1.0f / slope;
-        // the voxels at the window's borders, and by how many voxels these are softened
-        const float one = (low - row) * per_row;
-        const float other = (high - row) * per_row;
-        const float lowest = SMALLER(one, other);
-        const float highest = LARGER(one, other);
-        const float soft = half_width * fabs(per_row);
-        if (highest + soft <= 0.0f || lowest - soft >= voxels - 1)
+        const float low = fma(h, border[2] - border[0], border[0]);
+        const float high = fma(h, border[3] - border[1], border[1]);
+        // half the height over which the window's borders are softened
+        const float half_width = fma(0.5f * z_step, fabs(slope), 0.5f);
+        if (last <= low - half_width || first >= high + half_width)
             continue;
-        const int start = (int)LARGER(lowest - soft, 0.0f) / LANES * LANES;
-        const int stop = (int)SMALLER(highest + soft, voxels - 1.0f) + 1;
-
-        global const float *line = projections + ((size_t)view * (columns + 1) + c) * pitch;
-        global const float *next = line + pitch;
-        const float next_weight = f * scale;
-        const float line_weight = scale - next_weight;
-#if LANES > 1
-        if (fabs(slope) * (LANES - 1) <= SPAN) {
-            steps step = steps_from(fma(slope, (float)start, row), slope);
-            for (int k = start; k < stop; k += LANES) {
-                const int base = step_base(step);
-                const whole at = step_lanes(step);
-                const piece both = blend(line_weight, line + base, next_weight, next + base);
-                real value = between(both, whole_part(at), fraction(at));
-                if (k < lowest + soft || k + (LANES - 1) > highest - soft)
-                    value *= inside(slope * ((float)k + RAMP) + row, low, high, per_width);
-                store_lanes(load_lanes(sum + k) + value, sum + k);
-                step.lowest += step.advance;
+        const float per_width = 0.5f * reciprocal(half_width);
+        global const float *image = projections + (size_t)view * (rows * COLUMNS);
+        const float right = h * scale, left = scale - right;
+        if (INSIDE || (c < columns - 1 && first >= 0.0f && last < last_row)) {
+            const uint base = UNIT * ((uint)c - BIAS * (uint)COLUMNS);
+#pragma unroll
+            for (int k = 0; k < VOXELS; ++k) {
+                const float row = fma(slope, (float)k, row0);
+                const float t = (row - 0.5f) + MAGIC;
+                const float f = row - (t - MAGIC);
+                const uint at = WHOLE(t) * (UNIT * COLUMNS) + base;
+                const float p = left * PIXEL(image, at, 0) + right * PIXEL(image, at, 1);
+                const float q = left * PIXEL(image, at, COLUMNS) +
+                                right * PIXEL(image, at, COLUMNS + 1);
+                const float chi = SATURATE(fma(row - low, per_width, 0.5f)) *
+                                  SATURATE(fma(high - row, per_width, 0.5f));
+                sum[k] = fma(chi, fma(f, q - p, p), sum[k]);
             }
-            continue;
-        }
-#endif
-        for (int k = start; k < stop; ++k) {
-            const float r = fma(slope, (float)k, row);
-            const float chi = FIRST(inside((real)(r), low, high, per_width));
-            sum[k] += chi * (line_weight * tap(line, rows, r) + next_weight * tap(next, rows, r));
+        } else {
+            // One voxel after the other: all at once would take twice the registers.
+            const int next = c < columns - 1;
+#pragma unroll 1
+            for (int k = 0; k < VOXELS; ++k) {
+                const float row = fma(slope, (float)k, row0);
+                const int r = below(clamp(row, -2.0f, rows + 1.0f));
+                const float f = row - r;
+                float value = 0.0f;
+                if (r >= 0 && r < rows) {
+                    global const float *at = image + (r * columns + c);
+                    value = (1.0f - f) * (left * at[0] + right * at[next]);
+                }
+                if (r >= -1 && r + 1 < rows) {
+                    global const float *at = image + ((r + 1) * columns + c);
+                    value = fma(f, left * at[0] + right * at[next], value);
+                }
+                value *= SATURATE(fma(row - low, per_width, 0.5f)) *
+                         SATURATE(fma(high - row, per_width, 0.5f));
+#pragma unroll
+                for (int n = 0; n < VOXELS; ++n)
+                    sum[n] += n == k ? value : 0.0f;
+            }
         }
     }
-
-    volume += column_of_voxels * nz + z;
-    for (int k = 0; k < voxels; ++k) {
-        float whole_of_it = 0.0f;
-        for (int n = 0; n < helices; ++n)
-            whole_of_it += part(spans + n * of_helix + 2 * column_of_voxels, (float)(z + k));
-        const float share = part(own, (float)(z + k));
-        if (share > 0.0f)
-            volume[k] += sum[k] * (share / whole_of_it);
-    }
+    volume += line * nz + z;
+#pragma unroll
+    for (int k = 0; k < VOXELS; ++k)
+        if (k < voxels)
+            volume[k] += sum[k] * share_of(spans, of_helix, helices, helix, (float)(z + k));
 }

@@ -9,6 +9,8 @@
 
 // Line integrals are taken to lie in this range: a hot pixel may show more than the open beam, and
 // none tells less than exp(-30).
+#include "group.clh"
+
 #define LEAST -1.0f
 #define MOST 30.0f
 
@@ -25,7 +27,7 @@ static inline float excess(const float open_beam, const float simulated, const f
 }
 
 // Adds, for each pixel of the detector, the Poisson deviance 2 (q - y + y log(y / q)) of all views.
-kernel void deviance(
+kernel required_group void deviance(
     global float *restrict sums, // (pixels)
     const ulong sums_offset,
     global const float *restrict simulated, // (views, pixels), line integrals
@@ -57,7 +59,7 @@ kernel void deviance(
 
 // (1 - y / q) b exp(-l): by how much the log-likelihood rises with less attenuation along a ray,
 // reversed; may overwrite `simulated`.
-kernel void gradient(
+kernel required_group void gradient(
     global float *gradient, // (views, pixels), photons
     const ulong gradient_offset,
     global const float *simulated, // (views, pixels), line integrals
@@ -83,7 +85,7 @@ kernel void gradient(
 
 // Chord times the curvature of the measured ray's likelihood at its maximum, (y - r)^2 / y; may
 // overwrite `chords`.
-kernel void curvature(
+kernel required_group void curvature(
     global float *weighted, // (views, pixels), photons mm
     const ulong weighted_offset,
     global const float *chords, // (views, pixels), length within the volume, mm
@@ -109,7 +111,7 @@ kernel void curvature(
 // Chord times the least curvature of a parabola that touches the ray's negative log-likelihood
 // h(l) = q - y log(q) at l and lies above it for all l >= 0: 2 (h(0) - h(l) + l h'(l)) / l^2, at
 // l = 0 h''(0). `simulated` may be overwritten.
-kernel void optimal_curvature(
+kernel required_group void optimal_curvature(
     global float *weighted, // (views, pixels), photons mm
     const ulong weighted_offset,
     global const float *simulated, // (views, pixels), line integrals
@@ -147,7 +149,7 @@ kernel void optimal_curvature(
 
 // Both sides of the balance that the maximum of the likelihood fulfils along the rays of a voxel:
 // b exp(-l), which overwrites `simulated`, and b exp(-l) y / q.
-kernel void balance(
+kernel required_group void balance(
     global float *restrict simulated, // (views, pixels), line integrals; then photons
     const ulong simulated_offset,
     global float *restrict found, // (views, pixels), photons
@@ -172,7 +174,7 @@ kernel void balance(
 }
 
 // mu <- max(0, mu + step numerator / denominator) where the denominator exceeds `least`
-kernel void add_step(
+kernel required_group void add_step(
     global float *restrict volume, // (voxels), 1/mm
     const ulong volume_offset,
     global const float *restrict numerator, // (voxels), photons mm
@@ -195,7 +197,7 @@ kernel void add_step(
 }
 
 // mu <- mu numerator / denominator, by a factor of 4 at most, where rays meet the voxel
-kernel void multiply_step(
+kernel required_group void multiply_step(
     global float *restrict volume, // (voxels), 1/mm
     const ulong volume_offset,
     global const float *restrict numerator, // (voxels), photons mm

@@ -19,7 +19,7 @@ static inline real pair_sums(global const float *p)
     return (real)(a.even + a.odd, b.even + b.odd);
 }
 
-kernel void restrict_2d(
+kernel required_group void restrict_2d(
     global float *restrict coarse, // (planes, rows, columns)
     const ulong coarse_offset,
     global const float *restrict fine, // (planes, fine_rows, fine_columns)
@@ -46,7 +46,7 @@ kernel void restrict_2d(
         coarse[c] = 0.25f * (fine[2 * c] + fine[2 * c + 1] + (next[2 * c] + next[2 * c + 1]));
 }
 
-kernel void restrict_3d(
+kernel required_group void restrict_3d(
     global float *restrict coarse, // (planes, rows, columns)
     const ulong coarse_offset,
     global const float *restrict fine, // (2 planes or one more, fine_rows, fine_columns)
@@ -101,7 +101,7 @@ static inline real mixed(
            + 0.0625f * load_global(far + at);
 }
 
-kernel void prolong_3d(
+kernel required_group void prolong_3d(
     global float *restrict fine, // (fine_planes, fine_rows, fine_columns)
     const ulong fine_offset,
     global const float *restrict coarse, // (planes, rows, columns), halves rounded down

@@ -9,6 +9,8 @@
 // A work-group moves one tile. Global size: (ceil(length / TILE), ceil(lines / TILE), planes)
 // groups or more of local size (any, 1, 1), with LANES 8 of (1, 1, 1).
 
+#include "group.clh"
+
 #ifndef LANES
 #define LANES 1 // 1 or 8
 #endif
@@ -16,7 +18,7 @@
 #define TILE (LANES == 1 ? 32 : 8)
 #endif
 
-kernel void transpose(
+kernel required_group void transpose(
     global float *restrict out, // [plane out_plane + column out_line + before + row]
     const ulong out_offset,
     const int out_plane, // elements

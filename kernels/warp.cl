@@ -41,7 +41,7 @@ static inline int position(
     return i + (int)whole;
 }
 
-kernel void prefilter_rows(
+kernel required_group void prefilter_rows(
     global float *restrict coefficients, // (views, rows, columns)
     const ulong coefficients_offset,
     global const float *restrict image, // (views, rows, columns)
@@ -90,7 +90,7 @@ kernel void prefilter_rows(
 }
 
 // Global size (blocks of LANES columns of a whole lined row, rows, views).
-kernel void resample_rows(
+kernel required_group void resample_rows(
     global float *restrict resampled, // lined (views, rows, stride)
     const ulong resampled_offset,
     global const float *restrict coefficients, // along rows' direction, (views, rows, columns)
@@ -132,7 +132,7 @@ kernel void resample_rows(
     }
 }
 
-kernel void prefilter_columns(
+kernel required_group void prefilter_columns(
     global float *restrict coefficients, // (views, rows, columns)
     const ulong coefficients_offset,
     global const float *restrict image, // lined (views, rows, stride)
@@ -157,7 +157,7 @@ kernel void prefilter_columns(
     store_columns(sum, coefficients + ((ulong)view * rows + j) * columns + i, columns - i);
 }
 
-kernel void resample_columns(
+kernel required_group void resample_columns(
     global float *restrict resampled, // (views, rows, columns)
     const ulong resampled_offset,
     global const float *restrict coefficients, // along columns' direction, (views, rows, columns)

@@ -39,6 +39,10 @@ TILTED = clra.ConeBeamGeometry(
     v=GEOMETRY.v + 0.05 * GEOMETRY.u,
     shape=GEOMETRY.shape,
 )
+# Some rays advance fastest along z.
+STEEP = clra.circular(
+    VIEWS, source_to_axis=25.0, source_to_detector=50.0, pixel_size=7.0, shape=(ROWS, COLUMNS)
+)
 HELIX = Helix(
     views=13,
     start=0.4,
@@ -132,6 +136,11 @@ CASES = {
     ),
     "tilted adjoint": Case(
         lambda c, **a: clra.BackProjector(c, TILTED, GRID, matched=True, **a),
+        GRID.shape,
+        (values(*IMAGES),),
+    ),
+    "steep adjoint": Case(
+        lambda c, **a: clra.BackProjector(c, STEEP, GRID, matched=True, **a),
         GRID.shape,
         (values(*IMAGES),),
     ),
@@ -234,6 +243,7 @@ WITH_SCRATCH = (
     "tilted forward",
     "tilted back",
     "tilted adjoint",
+    "steep adjoint",
     "katsevich",
     "pi back",
     "ramp",

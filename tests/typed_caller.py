@@ -31,7 +31,13 @@ def reconstruct(path: str) -> np.ndarray[Any, np.dtype[np.float32]]:
     result = clra.align(scan, schedule="1QR-1HR")
     assert_type(result, AlignmentResult)
     assert_type(result.motion, clra.Motion)
-    assert_type(clra.correct(scan, result.motion), clra.Scan)
+    assert_type(result.warnings, tuple[clra.Finding, ...])
+    assert_type(clra.correct(scan, result), clra.Scan)
+    clra.write_alignment("motion.h5", result)
+    result = clra.read_alignment("motion.h5")
+    options = clra.Multigrid(levels="HR-FR", i0=4000)
+    clra.reconstruct(scan, "imgr", alignment=result, options=options, checkpoint="kept")
+    clra.reconstruct(scan, "osem-tr", options=clra.OrderedSubsets(passes=2), resume=True)
     return clra.reconstruct(scan, motion=result.motion)
 
 

@@ -1,19 +1,23 @@
 """Check every kernel for GPUs on a machine without one: ``python tools/check_gpu.py``.
 
-Compiles ``kernels/`` for NVIDIA (clang to PTX, ptxas for sm_80 and sm_90) and AMD (gfx90a) in the
-forms that the operators use on GPUs, and prints registers, spills, private memory, local memory and
-occupancy. Fails on a spill or above 64 registers. Also holds the sources to the subset of OpenCL C
-that every driver has, and validates their SPIR-V. A check whose tools are missing is skipped with
-one line, an error with ``--require``.
+Compiles ``kernels/`` for NVIDIA (clang to PTX, ptxas for sm_80, sm_89 and sm_90) and AMD (gfx90a)
+in the forms that the operators use on GPUs, and prints registers, spills, private memory, local
+memory and occupancy. Fails on a spill, private memory, a kernel without a required work-group, or
+above 64 registers but for those listed in gpu_usage.py. Counts the instructions of what takes a
+GPU's time and fails above the limits of gpu_limits.py. Also holds the sources to the subset of
+OpenCL C that every driver has, and validates their SPIR-V. A check whose tools are missing is
+skipped with one line, an error with ``--require``.
 """
 
 import argparse
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from compilers import APT, Missing, clang, defined, program, run
+from gpu_limits import GPUS, Cost, amd_costs, costs, limits_table
 from gpu_usage import GPU_FORMS, Usage, amd, nvidia
 
 from clra import kernels
@@ -23,7 +27,7 @@ CPU_ONLY = {
     f"{stem}_{form}.cl"
     for stem in ("adjoint", "backproject", "forwardproject")
     for form in ("columns", "tilted")
-}
+} | {"adjoint_steep.cl", "pi_backprojector_columns.cl"}
 # What CPUs run: with AVX-512 the projectors' vectors are wider.
 CPU_FORM: Mapping[str, int] = {"LANES": 8, "GROUP": 1, "BLOCK": 128}
 
@@ -36,7 +40,13 @@ def forms(file: str) -> tuple[Mapping[str, int], ...]:
 
 
 def portable(file: str, folder: Path) -> Iterator[Usage]:
-    """Hold a file to OpenCL C 1.2 without extensions and without double precision."""
+    """Hold a file to OpenCL C 1.2 without extensions and without double precision.
+
+    Kernels that GPUs run have to be compiled for the work-groups that they run in.
+    """
+    loose = re.findall(r"^kernel void (\w+)", kernels.source(file), re.MULTILINE)
+    if loose and file not in CPU_ONLY:
+        raise RuntimeError(f"no work-group required of {', '.join(loose)}")
     options = ["-target", "spir64", "-Xclang", "-finclude-default-header"]
     options += ["-Xclang", "-cl-ext=-all", "-fsyntax-only", "-Wall", "-Wextra"]
     options += ["-Wdouble-promotion", "-Wno-unused-parameter", "-Werror"]
@@ -59,6 +69,22 @@ def spirv(file: str, folder: Path) -> Iterator[Usage]:
 
 
 CHECKS = {"portable": portable, "spirv": spirv, "nvidia": nvidia, "amd": amd}
+
+
+def limits(folder: Path) -> list[str]:
+    """Print what kernels cost that there are limits for; the limits that are broken."""
+    found: list[Cost] = []
+    missing: Missing | None = None
+    for counted in (costs(folder, list(GPUS)), amd_costs(folder)):
+        try:
+            found += counted
+        except Missing as one:
+            missing = one
+    if found:
+        print(limits_table(found))
+    if missing is not None:
+        raise missing
+    return [fault for cost in found for fault in cost.faults]
 
 
 def table(usages: Sequence[Usage]) -> str:
@@ -85,7 +111,9 @@ def table(usages: Sequence[Usage]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("files", nargs="*", help="kernel files, all by default")
-    parser.add_argument("--only", choices=CHECKS, action="append", help="checks, all by default")
+    parser.add_argument(
+        "--only", choices=[*CHECKS, "limits"], action="append", help="checks, all by default"
+    )
     parser.add_argument("--require", action="store_true", help="fail where a check is skipped")
     given = parser.parse_args(arguments)
     usages: list[Usage] = []
@@ -98,8 +126,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (folder / file).write_text(kernels.source(file))
         known = GPU_FORMS.keys() | CPU_ONLY
         faults += [f"{file}: not in GPU_FORMS" for file in files if file not in known]
-        for check in given.only or CHECKS:
+        for check in given.only or [*CHECKS, "limits"]:
             try:
+                if check == "limits":
+                    faults += limits(folder)
+                    continue
                 of_check = GPU_FORMS if CHECKS[check] in (nvidia, amd) else known
                 for file in filter(of_check.__contains__, files):
                     try:
@@ -114,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     faults += [fault for use in usages for fault in use.faults()]
     for fault in faults:
         print(f"FAILED {fault}")
-    checked = len(given.only or CHECKS) - skipped
+    checked = len(given.only or [*CHECKS, "limits"]) - skipped
     print(f"{len(files)} files, {checked} checks, {skipped} skipped, {len(faults)} failed")
     return int(bool(faults) or (given.require and skipped > 0))
 

@@ -38,12 +38,12 @@ def clang(version: int, *options: str) -> list[str]:
     return [program(f"clang-{version}", how), "-x", "cl", BUILD_OPTIONS[0], *options]
 
 
-def run(command: Sequence[str], folder: Path) -> str:
-    """Run a command in a folder; its standard error, as a RuntimeError if it fails."""
+def run(command: Sequence[str], folder: Path, *, output: bool = False) -> str:
+    """Run a command in a folder; its standard error or output, a RuntimeError if it fails."""
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{Path(command[0]).name} failed:\n{done.stderr.strip()}")
-    return done.stderr
+    return done.stdout if output else done.stderr
 
 
 def defined(form: Mapping[str, int]) -> list[str]:

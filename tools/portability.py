@@ -3,6 +3,7 @@
 ``python tools/portability.py [NAME ...] [--quick]`` runs, each where it is installed:
 
 - ``intel``: all tests on Intel's CPU runtime (wheels ``intel-opencl-rt intel-cmplr-lib-rt``);
+- ``debian-pocl``: all tests on Debian's PoCL (``pocl-opencl-icd``), beside the wheel's;
 - ``rusticl``: every operator on Mesa's Rusticl with llvmpipe (Debian ``mesa-opencl-icd``);
 - ``two-devices``: every operator on either device of a context of two (PoCL);
 - ``oclgrind``: every kernel, in both forms, with race detection and API checks (Debian
@@ -28,6 +29,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 INTEL = Path(sys.prefix) / "lib" / "libintelocl.so"
 RUSTICL = Path("/etc/OpenCL/vendors/rusticl.icd")
+DEBIAN_POCL = Path("/etc/OpenCL/vendors/pocl.icd")
 WHEELS = ("intel-opencl-rt", "intel-cmplr-lib-rt")
 
 KERNELS = "tests/ops/test_every_kernel.py"
@@ -79,6 +81,10 @@ def no_intel() -> str:
     return "" if INTEL.exists() else f"no {INTEL.name} (pip install {' '.join(WHEELS)})"
 
 
+def no_debian_pocl() -> str:
+    return "" if DEBIAN_POCL.exists() else f"no {DEBIAN_POCL} (Debian: pocl-opencl-icd)"
+
+
 def no_rusticl() -> str:
     return "" if RUSTICL.exists() else f"no {RUSTICL} (Debian: mesa-opencl-icd)"
 
@@ -100,6 +106,13 @@ def runs(quick: bool) -> dict[str, Run]:
             {"OCL_ICD_VENDORS": "{icds}", "CLRA_DEVICE": "Intel"},
             "Intel",
             icds=(INTEL,),
+        ),
+        "debian-pocl": Run(
+            QUICK if quick else (),
+            no_debian_pocl,
+            {"OCL_ICD_VENDORS": "{icds}"},
+            "debian",  # the newer of the two, and so the default
+            icds=(DEBIAN_POCL,),
         ),
         "rusticl": Run(
             (KERNELS,) if quick else OPERATORS,

@@ -14,13 +14,13 @@ pixels are those of the paper's detector.
 import numpy as np
 
 import clra
-from clra.methods.alignment.level import reprojections
 from clra.methods.alignment.reprojection import (
     registration_for,
     reproject_and_register,
     with_margin,
 )
 from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.reconstruction.fitted_fbp import fitted_fbp
 from clra.model.gauge.gauge import Gauge, sample_points, without_gauge
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import porous
@@ -62,8 +62,12 @@ def residuals(scan: clra.Scan, motion: clra.Motion) -> tuple[float, float]:
     grid = with_margin(default_grid(scan.geometry))
     volume = ramp_fbp(stream, radiographs, geometry, grid, stage="reconstructing")
     left = [_left(stream, scan, radiographs, volume, motion)]
-    sharper = reprojections(stream, volume, geometry, 1, "re-projecting", lacking_of=radiographs)
-    volume = ramp_fbp(stream, sharper, geometry, grid, stage="reconstructing")
+    used = np.ones(scan.geometry.shape, np.bool_)
+    volume = fitted_fbp(
+        stream, radiographs, geometry, grid,
+        positive=True, terms=1, used=used, valid_views=np.ones(scan.views, np.bool_),
+        circle=True, stage="reconstructing",
+    )  # fmt: skip
     left.append(_left(stream, scan, radiographs, volume, motion))
     return left[0], left[1]
 

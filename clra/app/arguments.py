@@ -1,10 +1,17 @@
 """Option values that are more than a number or a name."""
 
+from __future__ import annotations
+
 import math
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from clra.errors import InputError
+
+if TYPE_CHECKING:
+    from clra.io.volumes.integer_limits import Limits
+    from clra.model.grid import Region
 
 
 def detector(option: str, text: str) -> tuple[int, int]:
@@ -120,6 +127,60 @@ def memory_size(option: str, text: str) -> int:
     return count
 
 
+def region(option: str, text: str) -> Region:
+    """Read "X0:X1,Y0:Y1,Z0:Z1" [mm]; an end that is left out is that of the field of view.
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        For example "-1:1,-1:1,0:" or ":,:,-0.5:0.5".
+
+    Raises
+    ------
+    InputError
+        If it is not that.
+    """
+    number = r"\s*([-+.\deE]*)\s*"
+    found = re.fullmatch(",".join([f"{number}:{number}"] * 3), text)
+    try:
+        ends = [float(end) if end else None for end in found.groups()] if found else []
+    except ValueError:
+        ends = []
+    if len(ends) != 6:
+        expected = "X0:X1,Y0:Y1,Z0:Z1 in mm such as -1:1,-1:1,0:"
+        raise InputError(f"{option}: found {text!r}, expected {expected}")
+    return (ends[0], ends[1]), (ends[2], ends[3]), (ends[4], ends[5])
+
+
+def limits_of_integers(option: str, text: str) -> Limits:
+    """Read "LOW,HIGH" [1/mm] or "LOW%,HIGH%" of the voxels.
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        For example "0,0.2" or "0.1%,99.9%".
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    from clra.io.volumes.integer_limits import Limits
+
+    parts = [part.strip() for part in text.split(",")]
+    percent = all(part.endswith("%") for part in parts)
+    try:
+        low, high = (float(part.removesuffix("%") if percent else part) for part in parts)
+    except ValueError:
+        expected = "LOW,HIGH in 1/mm or LOW%,HIGH%"
+        raise InputError(f"{option}: found {text!r}, expected {expected}") from None
+    return Limits(low, high, percent)
+
+
 def volume_file(path: Path) -> None:
     """Check that a volume of that name can be written.
 
@@ -133,10 +194,8 @@ def volume_file(path: Path) -> None:
     InputError
         If there is no such format.
     """
-    from clra.io.volumes.volume_files import HDF5, TIFF
+    from clra.io.volumes.volume_files import SUFFIXES
 
-    expected = ", ".join((HDF5[0], *TIFF))
-    if path.suffix.lower() == ".zarr":
-        raise InputError(f"{path}: zarr volumes cannot be written yet, expected {expected}")
-    if path.suffix.lower() not in HDF5 + TIFF:
+    if path.suffix.lower() not in SUFFIXES:
+        expected = ", ".join(SUFFIXES)
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected one of {expected}")

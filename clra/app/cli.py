@@ -8,6 +8,7 @@ from clra.app.commands.align import align
 from clra.app.commands.correct import correct
 from clra.app.commands.demo import demo
 from clra.app.commands.devices import devices
+from clra.app.commands.export_motion import export_motion
 from clra.app.commands.import_scan import import_scan
 from clra.app.commands.info import info
 from clra.app.commands.reconstruct import reconstruct
@@ -65,12 +66,13 @@ def _clra(
 
 command(app, "devices")(devices)
 command(app, "info")(info)
-command(app, "import")(import_scan)
-command(app, "simulate")(simulate)
-command(app, "align")(align)
-command(app, "reconstruct")(reconstruct)
-command(app, "correct")(correct)
-command(app, "report")(report)
+command(app, "import", writes=True)(import_scan)
+command(app, "simulate", writes=True)(simulate)
+command(app, "align", writes=True)(align)
+command(app, "reconstruct", writes=True)(reconstruct)
+command(app, "correct", writes=True)(correct)
+command(app, "report", writes=True)(report)
+command(app, "export-motion", writes=True)(export_motion)
 command(app, "demo")(demo)
 
 

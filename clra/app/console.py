@@ -16,9 +16,13 @@ import numpy as np
 import typer
 
 from clra.app import progress_bar
+from clra.errors import InputError
+from clra.findings import collected, collected_so_far
 
 if TYPE_CHECKING:
+    from clra.io.scanners.scanner_options import ScannerOptions
     from clra.io.scanners.scanner_scan import ScannerScan
+    from clra.model.motion import Motion
     from clra.model.scan import Scan
     from clra.progress import ProgressCallback
 
@@ -54,9 +58,21 @@ class Console:
         print(to_json(values) if self.json else text)
 
     def summary(self, values: Mapping[str, Any], text: str) -> None:
-        """Print what a command that wrote a file has to say of it, unless quiet."""
+        """Print what a command that wrote a file has to say of it, unless quiet.
+
+        As JSON it has the findings of the whole command, too.
+        """
         if self.json or not self.quiet:
-            self.result(values, text)
+            self.result({**values, "warnings": collected_so_far(outermost=True)}, text)
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How a command may write."""
+
+    no_overwrite: Annotated[
+        bool, typer.Option("--no-overwrite", help="Refuse to replace files that are there.")
+    ] = False
 
 
 @dataclass(frozen=True)
@@ -147,10 +163,28 @@ class Reading:
 
     def scanner(self, path: Path) -> "ScannerScan | None":
         """Read the metadata of a scanner; None of an NXtomo file."""
-        from clra.io.scanners.recognise import read_scanner
+        from clra.io.scanners.recognise import read_scanner, recognise
+
+        return None if recognise(path) is None else read_scanner(path, self._options())
+
+    def start_motion(self, path: Path, views: int) -> "Motion | None":
+        """Read a motion of a table, or that a scanner's software measured; None of other files."""
+        from clra.io.motion_formats.motion_csv import is_motion_csv, read_motion_csv
+        from clra.io.scanners.recognise import holds_start_motion, read_start_motion
+
+        if is_motion_csv(path):
+            motion = read_motion_csv(path)[0]
+            if motion.views != views:
+                raise InputError.at(path, "view", f"{motion.views} views", f"{views} of the scan")
+            return motion
+        if not holds_start_motion(path):
+            return None
+        return read_start_motion(path, views, self._options())
+
+    def _options(self) -> "ScannerOptions":
         from clra.io.scanners.scanner_options import ScannerOptions
 
-        options = ScannerOptions(
+        return ScannerOptions(
             rotation=self.rotation,
             source_distance=self.source_distance,
             parallel=self.parallel,
@@ -158,7 +192,6 @@ class Reading:
             flip=self.flip,
             centre_offset=self._axis(),
         )
-        return read_scanner(path, options)
 
     def _axis(self) -> tuple[float, ...] | None:
         from clra.app.arguments import axis_place
@@ -220,7 +253,9 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def command(
+    app: typer.Typer, name: str, *, writes: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a function as a command; groups of options among its parameters are spread out.
 
     Parameters
@@ -229,6 +264,9 @@ def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Call
         Where to.
     name : str
         What the command is called.
+    writes : bool
+        Whether it writes files: it has the options of :class:`Writing`, and its outputs are its own
+        until it ends.
 
     Returns
     -------
@@ -248,11 +286,21 @@ def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Call
                 shared += _options(group)
             else:
                 own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if writes:
+            shared += _options(Writing)
 
         def run(**values: Any) -> None:
             for key, group in groups.items():
                 values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
-            function(**values)
+            if not writes:
+                with collected():
+                    function(**values)
+                return
+            from clra.io.claims import one_run
+
+            writing = Writing(**{f.name: values.pop(f.name) for f in fields(Writing)})
+            with one_run(overwrite=not writing.no_overwrite), collected():
+                function(**values)
 
         # typer learns a command's options from its signature and its annotations.
         run.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]

@@ -1,6 +1,7 @@
 """What an error means to the caller of a command: an exit status and one line on stderr."""
 
 import errno
+import shlex
 import signal
 import sys
 import threading
@@ -8,11 +9,15 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
 
 from typer.core import TyperGroup
 
 from clra.errors import InputError
+
+if TYPE_CHECKING:
+    from clra.methods.execution.checkpoint import Checkpoint
 
 OK = 0
 FAILED = 1
@@ -21,6 +26,14 @@ INTERRUPTED = 130
 
 _DEBUG = "--debug"
 _BUG = "this is a bug in clra, please report it with all that is printed here"
+
+
+_COMMAND: ContextVar[str] = ContextVar("command", default="")
+
+
+def command_line() -> str:
+    """Return the command line that is being run, as a shell would take it."""
+    return _COMMAND.get()
 
 
 class InterruptedCommandError(Exception):
@@ -34,6 +47,25 @@ class InterruptedCommandError(Exception):
 
     def __init__(self, kept: str = "nothing was written") -> None:
         super().__init__(f"interrupted: {kept}")
+
+
+@contextmanager
+def keeping(checkpoint: "Checkpoint") -> Iterator[None]:
+    """Say what of a block's finished work is on disk, whatever ends it early."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not checkpoint.kept:
+            raise
+        raise InterruptedCommandError(_goes_on(checkpoint)) from None
+    except Exception as error:
+        if checkpoint.kept:
+            error.add_note(_goes_on(checkpoint))
+        raise
+
+
+def _goes_on(checkpoint: "Checkpoint") -> str:
+    return f"{checkpoint.folder} keeps {checkpoint.kept}, --resume goes on from there"
 
 
 def verdict(error: BaseException) -> tuple[int, str]:
@@ -53,7 +85,8 @@ def verdict(error: BaseException) -> tuple[int, str]:
         Without a line break.
     """
     status, text = _verdict(error)
-    return status, " ".join(text.split())
+    notes = () if status == BAD_INPUT else getattr(error, "__notes__", ())
+    return status, " ".join("; ".join((text, *notes)).split())
 
 
 def _verdict(error: BaseException) -> tuple[int, str]:
@@ -158,6 +191,7 @@ class Group(TyperGroup):
         given = list(sys.argv[1:] if args is None else args)
         # Wanted mostly after something failed, so it may be added at either end of the line.
         debug = _DEBUG in given
+        _COMMAND.set(shlex.join(["clra", *given]))
         try:
             with _plain_warnings(), _ended_like_ctrl_c():
                 status = super().main(

@@ -1,24 +1,20 @@
 """What data tell against the way in which a scan is read, or against what alignment found."""
 
 import math
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from clra.findings import warn
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 
 if TYPE_CHECKING:
-    from clra.methods.alignment.quality import Quality
+    from clra.methods.alignment.agreement import Agreement
 
 # Transmission that no sample causes, and the part of the pixels in which it may be all the same:
 # the rims of phase contrast are as bright, flats that fit badly are not.
 _BRIGHT, _RIMS = 1.5, 0.01
-# Sharpening by the other sense of turning from which on the sense is doubted. On four trajectories
-# with and without noise, rocks and wood: 1.3 to 2.2 where it was wrong (1.09 on 200 degrees of a
-# circle), 0.4 to 0.8 where right; spheres on the axis 0.99 to 1.01, a parallel beam 1.00.
-_SHARPER = 1.05
 
 
 def warn_of_scale(scan: Scan) -> None:
@@ -37,48 +33,27 @@ def warn_of_scale(scan: Scan) -> None:
     pixels = np.concatenate([np.ravel(scan.projections[k : k + 1]) for k in few])
     dark, bright = np.mean(pixels <= 0), np.mean(pixels > _BRIGHT)
     if dark > 0.5:
-        warnings.warn(
+        warn(
+            "intensity-scale",
             f"{scan.name}: {dark:.0%} of the pixels are not brighter than the darks: are flats and "
             "darks of these frames, or do the frames hold transmission or line integrals already "
             "(clra import --kind)?",
-            stacklevel=3,
         )
     elif bright > _RIMS:
-        warnings.warn(
+        warn(
+            "intensity-scale",
             f"{scan.name}: {bright:.0%} of the pixels are more than {_BRIGHT:g} times as bright as "
             "the open beam: are the flats of these frames, is the byte order right, or do they "
             "hold line integrals (clra import --kind)?",
-            stacklevel=3,
         )
 
 
-def doubt_of_turning(sharpening: float) -> str:
-    """Return a warning if slices are sharper with the sample turning the other way.
-
-    Parameters
-    ----------
-    sharpening : float
-        Mean squared gradient of slices that way, relative to the sense taken.
-
-    Returns
-    -------
-    str
-        Empty if all is well.
-    """
-    if not sharpening > _SHARPER:
-        return ""
-    return (
-        f"slices are sharper by a factor of {sharpening:.2f} if the sample turns the other way, or "
-        "the radiographs are mirrored: try the other --rotation (cw, ccw) in clra import or here"
-    )
-
-
-def doubt_of_shifts(quality: "Quality", motion: Motion) -> str:
+def doubt_of_shifts(quality: "Agreement", motion: Motion) -> str:
     """Return a warning if half scans disagree on the shifts by more than there is of them.
 
     Parameters
     ----------
-    quality : Quality
+    quality : Agreement
         Of the alignment.
     motion : Motion
         That it found.

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 # Size of the test: views, and the most columns of a radiograph. It takes about a second on two
 # cores; with half of the columns launching counts and the estimate is a third too long.
 _TEST_VIEWS, _TEST_COLUMNS = 48, 160
+# Rows and columns that a registration needs at least.
+_LEAST = 16
 # Heights at which the views that see the axis are counted.
 _HEIGHTS = 64
 
@@ -132,22 +134,29 @@ def measure(
     nz, ny, nx = grid.shape
     shape = (small.views, *small.shape)
     # Something to register: the same smooth pattern in every radiograph.
-    row, column = np.ogrid[: shape[1], : shape[2]]
+    sheet = (max(shape[1], _LEAST), max(shape[2], _LEAST))
+    row, column = np.ogrid[: sheet[0], : sheet[1]]
     pattern = np.sin(row / 5.0) * np.cos(column / 7.0) + np.sin((row + column) / 11.0)
-    radiographs = stream.upload(np.tile(pattern.astype(np.float32), (shape[0], 1, 1)))
+    sheets = np.tile(pattern.astype(np.float32), (shape[0], 1, 1))
+    radiographs = stream.upload(np.ascontiguousarray(sheets[:, : shape[1], : shape[2]]))
+    registered = radiographs if sheet == small.shape else stream.upload(sheets)
     filtered, volume = stream.empty(shape), stream.empty((ny, nx, nz))
     estimates = stream.empty((shape[0], len(ESTIMATE_FIELDS)))
     ramp = RampFilter(context, small)
     back = BackProjector(context, small, grid, volume_order="yxz")
     forward = ForwardProjector(context, small, grid, volume_order="yxz")
-    register = Registration(context, small.shape, views=small.views)
+    register = Registration(context, sheet, views=small.views)
     updates = float(np.prod(grid.shape)) * views_a_voxel(small, grid)
     pixels = float(np.prod(shape))
     work: tuple[tuple[str, Callable[[], Any], float], ...] = (
         ("filtering", lambda: ramp(queue, filtered, radiographs), pixels),
         ("back", lambda: back(queue, volume, filtered), updates),
         ("forward", lambda: forward(queue, filtered, volume), updates),
-        ("registering", lambda: register(queue, estimates, radiographs, radiographs), pixels),
+        (
+            "registering",
+            lambda: register(queue, estimates, registered, registered),
+            float(sheets.size),
+        ),
     )
     work += _exact_work(stream, geometry, level)
     seconds = {}

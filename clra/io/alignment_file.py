@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from clra.errors import InputError
 from clra.findings import Finding
 from clra.io.atomic import atomic_path
+from clra.io.damage import reads
 from clra.io.hdf5 import find, open_hdf5, require, text
 from clra.methods.alignment import quality as quality_module
 from clra.methods.alignment.result import AlignmentResult, Iteration, SupportsAsDict
@@ -93,6 +94,7 @@ def write_alignment(path: str | os.PathLike[str], result: AlignmentResult) -> No
         temporary.write_bytes(image)
 
 
+@reads
 def read_alignment(path: str | os.PathLike[str]) -> AlignmentResult:
     """Read an alignment; only the shifts must be there.
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from clra.errors import InputError
 
+# Views, rows and columns are no more than this: a broken number shall not fill the memory.
+MOST = 1_000_000
 _NUMBER = re.compile(
     r"([-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][-+]?\d+)?)(?:[\s°]*[a-zA-Zµ°%/]*)?$"
 )
@@ -146,12 +149,12 @@ class KeyValueText:
             raise InputError.at(self.path, _field(keys, section), "nothing", expected)
         match = _NUMBER.match(value.partition(";")[0].strip())
         number = float(match[1].replace(",", ".")) if match else float("nan")
-        if not match or (positive and not number > 0):
+        if not math.isfinite(number) or (positive and not number > 0):
             raise InputError.at(self.path, _field(keys, section), repr(value[:40]), expected)
         return number
 
     def whole(self, *keys: str, section: str | None = None, default: int | None = None) -> int:
-        """Return a whole number above 0.
+        """Return a whole number above 0, of views or pixels.
 
         Raises
         ------
@@ -161,9 +164,9 @@ class KeyValueText:
         value = self.number(
             *keys, section=section, default=None if default is None else float(default)
         )
-        if value < 1 or value != int(value):
+        if not 1 <= value <= MOST or value != int(value):
             field = _field(keys, section)
-            raise InputError.at(self.path, field, f"{value:g}", "a whole number above 0")
+            raise InputError.at(self.path, field, f"{value:g}", f"a whole number of 1 to {MOST}")
         return int(value)
 
 

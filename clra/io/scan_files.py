@@ -11,18 +11,20 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.io.atomic import ensure_writable
+from clra.io.damage import reads
 from clra.io.nxtomo.fields import Overrides
 from clra.io.nxtomo.reader import read_nxtomo
 from clra.io.nxtomo.writer import write_nxtomo
-from clra.io.scanners.recognise import read_scanner
+from clra.io.provenance import Provenance
+from clra.io.scanners.recognise import read_scanner, recognise
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import ScannerScan
-from clra.model.detector_pose import with_axis_at
-from clra.model.image_flip import flipped
+from clra.model.detector_pose import flipped, with_axis_at
 from clra.model.scan import Scan
 from clra.progress import ProgressCallback
 
 
+@reads
 def read_scan(
     path: str | os.PathLike[str],
     *,
@@ -87,8 +89,9 @@ def read_scan(
         "centre_offset": centre_offset,
     }
     said = {name: value for name, value in given.items() if value is not None}
-    scanner = read_scanner(path, replace(options or ScannerOptions(), **said))
-    if scanner is not None:
+    if recognise(path) is not None:
+        scanner = read_scanner(path, replace(options or ScannerOptions(), **said))
+        assert scanner is not None  # it is recognised
         return scanner.scan(white)
     overrides = Overrides(rotation or "ccw", source_distance, parallel)
     scan = read_nxtomo(path, entry=entry, overrides=overrides, white=white)
@@ -150,6 +153,7 @@ def write_scan(
     scan: Scan,
     *,
     valid_views: NDArray[np.bool_] | None = None,
+    provenance: Provenance | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write a scan's line integrals as NXtomo; the file appears whole or not at all.
@@ -163,6 +167,8 @@ def write_scan(
     valid_views : ndarray of bool, (views,), optional
         Views to be used, at least one, all by default. The others are written as well, marked
         invalid: readers of NXtomo, :func:`read_scan` too, leave them out.
+    provenance : mapping of str to str, optional
+        Where it comes from, see :func:`clra.io.provenance.provenance`: attributes of the root.
     progress : callable, optional
         Called with a ``Progress`` as frames are written.
 
@@ -183,6 +189,7 @@ def write_scan(
         truth=scan.truth,
         mask=scan.mask,
         valid_views=valid_views,
+        provenance=provenance,
         progress=progress,
     )
 

@@ -6,12 +6,13 @@ import numpy as np
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reprojection import band_of, with_margin
+from clra.methods.reconstruction.fitted_fbp import VOLUMES
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.ops.projection.layout import view_elements
+from clra.ops.projection.layout import view_shape
 from clra.ops.registration.gauss_newton import pair_bytes
 from clra.ops.runtime.lines import line_stride
-from clra.ops.streaming.memory import Budgets
+from clra.ops.streaming.memory import Budgets, keeps
 
 # Bytes for an element of the windows and masks in registration.
 _WINDOW = 16
@@ -84,6 +85,7 @@ def reconstruction_need(
         + filtering
         + int(4 * coarse)
         + 200 * views
+        + _resident(budgets, geometry)
         + (2 if shared else 4) * chunk
     )
     piece = min(budgets.piece, _slab(budgets, grid, volumes))
@@ -106,9 +108,12 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     """
     geometry = full.binned(level) if level > 1 else full
     grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
-    # On small detectors its re-projections are kept beside the radiographs.
-    count = int(level > 1) + int(Solver().is_biased(geometry.shape))
-    return _registering_need(budgets, full, geometry, grid, 1, [_bytes(geometry)] * count)
+    # What the radiographs have beyond the re-projections is kept beside them; on small detectors
+    # the re-projections are as well.
+    solver = Solver()
+    count = int(level > 1) + int(solver.terms > 0) + int(solver.is_biased(geometry))
+    kept = [_bytes(geometry)] * count
+    return _registering_need(budgets, full, geometry, grid, VOLUMES, kept)
 
 
 def multigrid_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid) -> Need:
@@ -156,6 +161,7 @@ def _registering_need(
         + pair * pairs
         + _WINDOW * lined
         + (1 if shared else 2) * chunk
+        + _resident(budgets, geometry)
         + (0 if on_host else slab)
     )
     reading = _chunk(budgets, full)
@@ -177,6 +183,12 @@ def _bytes(geometry: ConeBeamGeometry) -> int:
     return 4 * geometry.views * int(np.prod(geometry.shape))
 
 
+def _resident(budgets: Budgets, geometry: ConeBeamGeometry) -> int:
+    """Bytes of the radiographs that stay on the device."""
+    size = _bytes(geometry)
+    return size if keeps(budgets, (geometry.views, *geometry.shape)) else 0
+
+
 def _limited(wanted: int, budgets: Budgets, shares: int = 1) -> int:
     return min(wanted, shares * budgets.scratch)
 
@@ -196,7 +208,10 @@ def _slab(budgets: Budgets, grid: VolumeGrid, volumes: int = 1) -> int:
 
 
 def _projecting(budgets: Budgets, geometry: ConeBeamGeometry, chunk: int) -> int:
-    """Bytes of padded lines in a projector."""
-    view, pixels = 4 * view_elements(geometry.shape), 4 * int(np.prod(geometry.shape))
+    """Bytes of padded lines in a projector; those of GPUs need none."""
+    if not budgets.profile.on_cpu:
+        return 0
+    pixels = 4 * int(np.prod(geometry.shape))
+    view = 4 * int(np.prod(view_shape(budgets.profile, geometry.shape)))
     most = max(1, _limited(budgets.profile.projector_bytes, budgets) // view)
     return view * min(most, max(1, chunk // pixels))

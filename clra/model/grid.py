@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.model.sampling.field_of_view import field_radii
 from clra.model.validation import positive, whole
 
 if TYPE_CHECKING:
@@ -136,9 +137,10 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
 
     A voxel is a pixel seen at the axis, |u| SOD / SDD (median over the views). In x and y the grid
     covers the circle about the axis that every view sees: its radius is the distance from the axis
-    to the nearer of the planes through the source and a side of the detector, SOD sin(half fan). In
-    z it covers the heights at which the axis is seen by at least half as many views as where it is
-    seen best.
+    to the nearer of the planes through the source and a side of the detector, SOD sin(half fan); to
+    the farther one if :func:`clra.model.sampling.field_of_view.is_offset`. In z it covers the
+    heights at which the axis is seen by at least half as many views as where it is seen best; of a
+    parallel beam without the planes of the outermost rows.
 
     Parameters
     ----------
@@ -168,34 +170,66 @@ def default_grid(geometry: ConeBeamGeometry) -> VolumeGrid:
     low, high = _axis_range(geometry)
     across = max(1, math.ceil(2 * radius / voxel - _SLACK))
     planes = max(1, math.ceil((high - low) / voxel - _SLACK))
+    if np.allclose(magnified, 1.0, rtol=1e-9):
+        # Of a far source that stands for a parallel beam, the outermost rows are seen at half of
+        # their planes only, where these lie before the axis.
+        planes = max(1, planes - 2)
     middle = 0.5 * (low + high)
     # A scan about z = 0 gets a grid about z = 0, not about what rounding left.
     z = middle if abs(middle) > _SLACK * voxel else 0.0
     return VolumeGrid(shape=(planes, across, across), voxel_size=voxel, centre=(0.0, 0.0, z))
 
 
-def field_radii(geometry: ConeBeamGeometry) -> Floats:
-    """Radius of the circle about the axis that each view sees, at the source's height.
+Interval = tuple[float | None, float | None]
+Region = tuple[Interval, Interval, Interval]
+
+
+def volume_grid(
+    geometry: ConeBeamGeometry,
+    *,
+    roi: Region | None = None,
+    voxel_size: float | None = None,
+) -> VolumeGrid:
+    """Return the grid of the field of view with another voxel, or a part of it.
 
     Parameters
     ----------
     geometry : ConeBeamGeometry
-        Of the scan.
+        Of the scan, at the resolution wanted.
+    roi : ((x0, x1), (y0, y1), (z0, z1)), optional
+        Region to cover [mm]; None for an end where :func:`default_grid` ends. Voxels are those of
+        the whole grid.
+    voxel_size : float, optional
+        In mm; by default that of :func:`default_grid`.
 
     Returns
     -------
-    ndarray, (views,)
-        [mm]; negative for a view that does not see the axis.
+    VolumeGrid
+
+    Raises
+    ------
+    InputError
+        If the region is empty.
     """
-    nearest = np.full(geometry.views, np.inf)
-    for side in (-1, 1):
-        edge = geometry.detector + side * geometry.columns / 2 * geometry.u - geometry.source
-        normal = np.cross(edge, geometry.v)
-        inward = np.sign(np.sum(normal * -side * geometry.u, axis=1))
-        horizontal = np.linalg.norm(normal[:, :2], axis=1)
-        distance = -np.sum(normal[:, :2] * geometry.source[:, :2], axis=1) * inward / horizontal
-        nearest = np.minimum(nearest, distance)
-    return nearest
+    whole = default_grid(geometry)
+    if voxel_size is not None:
+        size = positive("voxel_size", voxel_size)
+        nz, ny, nx = (max(1, math.ceil(n * whole.voxel_size / size - _SLACK)) for n in whole.shape)
+        whole = VolumeGrid(shape=(nz, ny, nx), voxel_size=size, centre=whole.centre)
+    if roi is None:
+        return whole
+    starts, counts = [], []
+    for name, (low, high), axis in zip("xyz", roi, whole.coordinates(), strict=True):
+        size, edge = whole.voxel_size, axis[0] - 0.5 * whole.voxel_size
+        start = 0 if low is None else math.floor((low - edge) / size + _SLACK)
+        stop = len(axis) if high is None else math.ceil((high - edge) / size - _SLACK)
+        if stop <= start or (low is not None and high is not None and high <= low):
+            found = f"{low} to {high} mm of {edge:.4g} to {edge + len(axis) * size:.4g} mm"
+            raise InputError(f"roi: found {name} {found}, expected two places in order")
+        starts.append(start)
+        counts.append(stop - start)
+    shape = (counts[2], counts[1], counts[0])
+    return whole._moved(shape, whole.voxel_size, (starts[0], starts[1], starts[2]))
 
 
 def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:

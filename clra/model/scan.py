@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -12,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
-from clra.model.bad_pixels import Patches
+from clra.findings import warn
+from clra.model.corrections.corrections import Corrections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.validation import selection
@@ -58,7 +58,10 @@ class Scan:
         The motion that a simulation put in.
     mask : array_like of bool, (rows, columns), optional
         True where the detector's pixels may be used. What the others hold is never used, be it NaN:
-        they are filled from beside.
+        they are interpolated from their neighbours.
+    corrections : Corrections, optional
+        What is corrected in the line integrals as they are read; see
+        :func:`clra.methods.preparation.prepared`, which finds out.
 
     Raises
     ------
@@ -72,6 +75,7 @@ class Scan:
     name: str = field(default="scan", kw_only=True)
     truth: Motion | None = field(default=None, kw_only=True)
     mask: NDArray[np.bool_] | None = field(default=None, kw_only=True)
+    corrections: Corrections | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         expected = (self.geometry.views, *self.geometry.shape)
@@ -96,6 +100,8 @@ class Scan:
                 )
             mask.flags.writeable = False
             object.__setattr__(self, "mask", mask)
+        if self.corrections is not None:
+            self.corrections.check(self.geometry.shape, self.name)
 
     @property
     def views(self) -> int:
@@ -142,10 +148,8 @@ class Scan:
         if self.kind == "transmission":
             self._warn_of_dark(pixels)
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
-        if self._patches is not None:
-            pixels = pixels.copy()
-            for image in pixels:
-                self._patches.fill(image)
+        if self._all_corrections is not None:
+            pixels = self._all_corrections.apply(pixels)
         # One such pixel would spread over the whole volume through filter and back-projection.
         finite = np.isfinite(pixels).all(axis=(1, 2))
         if not finite.all():
@@ -170,16 +174,27 @@ class Scan:
         part = (dark if self.mask is None else dark & self.mask).mean(axis=(1, 2))
         # A radiograph that is dark all over is no view of the sample, and found out elsewhere.
         if part[part < 0.5].max(initial=0) > _DARK:
-            warnings.warn(
+            warn(
+                "dark-pixels",
                 f"{self.name}: radiographs of which more than {_DARK:.0%} is dark, expected a "
                 f"transmission above {_DARKEST:g}: line integrals there are more than the "
                 f"{-np.log(_DARKEST):.3g} that they are taken as",
-                stacklevel=3,
             )
 
     @cached_property
-    def _patches(self) -> Patches | None:
-        return None if self.mask is None or self.mask.all() else Patches(~self.mask)
+    def _all_corrections(self) -> Corrections | None:
+        if self.mask is None or self.mask.all():
+            return self.corrections
+        return (self.corrections or Corrections()).masked(self.mask)
+
+    @property
+    def registration_mask(self) -> NDArray[np.bool_] | None:
+        """Pixels that registration may use, (rows, columns), or None if all.
+
+        Bad pixels whose neighbours tell their values, on thin lines too, do no harm.
+        """
+        unreliable = None if self._all_corrections is None else self._all_corrections.unreliable
+        return None if unreliable is None else ~unreliable
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -228,6 +243,9 @@ class Scan:
             name=self.name,
             truth=None if self.truth is None else self.truth.about(offset_u, offset_v),
             mask=None if mask.all() else mask,
+            corrections=None
+            if self.corrections is None
+            else self.corrections.cropped(rows, columns),
         )
 
     def subset(self, index: slice | ArrayLike) -> Scan:
@@ -246,6 +264,7 @@ class Scan:
             name=self.name,
             truth=None if self.truth is None else self.truth.subset(index),
             mask=self.mask,
+            corrections=self.corrections,
         )
 
 

@@ -84,8 +84,8 @@ def column(name: str, value: ArrayLike, each: str) -> Floats:
     return _finite_array(name, array, each)
 
 
-def believed_views(valid_views: ArrayLike, views: int) -> NDArray[np.bool_]:
-    """Check which views are valid_views: one value each, at least one of them true.
+def checked_valid_views(valid_views: ArrayLike, views: int) -> NDArray[np.bool_]:
+    """Check which views are valid: one value each, at least one of them true.
 
     Only bool will do: as an index, numbers would choose views 0 and 1.
     """

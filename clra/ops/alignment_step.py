@@ -10,6 +10,7 @@ from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.model.sampling.ray_weights import ray_weights
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage
 from clra.ops.projection.layout import volume_shape
@@ -91,12 +92,20 @@ class AlignmentStep:
         most = within(profile_of(context).step_bytes, scratch_limit)
         views = min(geometry.views, max(1, most // (4 * geometry.rows * geometry.columns)))
         within_limits: dict[str, Any] = {"allocator": memory, "scratch_limit": scratch_limit}
-        self._between = memory.empty((views, *geometry.shape))
-        self._ramp = RampFilter(context, geometry, row_weight=weights, **within_limits)
-        self._coverage = Coverage(context, geometry, grid, weights, allocator=memory)
-        self._back = BackProjector(
-            context, geometry, grid, volume_order=volume_order, **within_limits
+        rays = ray_weights(geometry)
+        self._scale = math.pi if rays is None else rays.covered / geometry.views
+        self._ramp = RampFilter(
+            context, geometry, row_weight=weights, ray_weights=rays, **within_limits
         )
+        wide = self._ramp.geometry
+        self._between = memory.empty((views, *geometry.shape))
+        self._filtered = self._between
+        if wide.shape != geometry.shape:
+            self._filtered = memory.empty((views, *wide.shape))
+        self._coverage = Coverage(
+            context, geometry, grid, weights, ray_weights=rays, allocator=memory
+        )
+        self._back = BackProjector(context, wide, grid, volume_order=volume_order, **within_limits)
         self._forward = ForwardProjector(
             context, geometry, grid, volume_order=volume_order, **within_limits
         )
@@ -119,7 +128,8 @@ class AlignmentStep:
             self._forward,
             self._registration,
         )
-        self.scratch_bytes = self._between.nbytes + sum(one.scratch_bytes for one in operations)
+        between = {id(one): one.nbytes for one in (self._between, self._filtered)}
+        self.scratch_bytes = sum(between.values()) + sum(one.scratch_bytes for one in operations)
         self._last: list[cl.Event] = []
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
@@ -131,7 +141,8 @@ class AlignmentStep:
             If views or detector differ, or the grid reaches behind a source.
         """
         # The projectors first: only they may refuse the grid, and then nothing has changed.
-        for operation in (self._back, self._forward, self._ramp, self._coverage):
+        self._back.set_geometry(self._ramp.filtered_geometry(geometry))
+        for operation in (self._forward, self._ramp, self._coverage):
             operation.set_geometry(geometry)
 
     def __call__(
@@ -203,14 +214,14 @@ class AlignmentStep:
         self, queue: cl.CommandQueue, volume: Array, radiographs: Array, event: cl.Event
     ) -> cl.Event:
         for part in self._parts():
-            filtered = self._between[: part.stop - part.start]
+            filtered = self._filtered[: part.stop - part.start]
             event = self._ramp(queue, filtered, radiographs[part], views=part, wait_for=[event])
             event = self._back(
                 queue, volume, filtered, views=part, accumulate=part.start > 0, wait_for=[event]
             )
         event = self._coverage.compute(queue, [event])
         return self._coverage.normalise(
-            queue, volume, math.pi, volume_order=self._order, wait_for=[event]
+            queue, volume, self._scale, volume_order=self._order, wait_for=[event]
         )
 
     def _parts(self) -> list[slice]:

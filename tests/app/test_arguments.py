@@ -2,7 +2,15 @@ from pathlib import Path
 
 import pytest
 
-from clra.app.arguments import detector, interval, pixel, volume_file
+from clra.app.arguments import (
+    detector,
+    interval,
+    limits_of_integers,
+    pixel,
+    region,
+    volume_file,
+)
+from clra.io.volumes.integer_limits import Limits
 
 
 def test_values_are_read():
@@ -23,7 +31,11 @@ def test_values_are_read():
         (lambda t: interval("--shift", t), "nan,1"),
         (pixel, "1,2,3"),
         (pixel, "thick"),
-        (lambda t: volume_file(Path(t)), "volume.zarr"),
+        (lambda t: volume_file(Path(t)), "volume.png"),
+        (lambda t: region("--roi", t), "0:1,0:1"),
+        (lambda t: region("--roi", t), "0:1,0:1,0:e"),
+        (lambda t: limits_of_integers("--limits", t), "1"),
+        (lambda t: limits_of_integers("--limits", t), "1%,2"),
         (lambda t: volume_file(Path(t)), "volume"),
     ],
 )
@@ -31,3 +43,12 @@ def test_what_cannot_be_read_is_refused_with_the_text_found(read, text):
     with pytest.raises(ValueError, match="expected") as caught:
         read(text)
     assert text in str(caught.value)
+
+
+def test_regions_may_leave_ends_open():
+    assert region("--roi", "-1:2.5,:,1e-1:") == ((-1.0, 2.5), (None, None), (0.1, None))
+
+
+def test_limits_are_values_or_percentiles():
+    assert limits_of_integers("--limits", "-1,2") == Limits(-1, 2, False)
+    assert limits_of_integers("--limits", "0.1%, 99%") == Limits(0.1, 99, True)

@@ -1,6 +1,7 @@
 """Commands in this process: what they print, refuse and write."""
 
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -35,10 +36,11 @@ def refused(done, status, *parts):
     code, out, err = done
     assert code == status, err
     assert out == ""
-    assert err.startswith("interrupted: " if status == 130 else "error: ")
-    assert err.count("\n") == 1 and err.endswith("\n")
+    *progress, line = err.splitlines()
+    assert line.startswith("interrupted: " if status == 130 else "error: ") and err.endswith("\n")
+    assert all(re.fullmatch(r".*: \d+ of \d+.*", told) for told in progress)
     for part in parts:
-        assert str(part) in err
+        assert str(part) in line
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -292,7 +294,7 @@ def test_ctrl_c_before_that_leaves_nothing(clra, monkeypatch, scan_file, tmp_pat
 
 def test_a_full_disk_is_noticed_before_work(clra, monkeypatch, scan_file, tmp_path):
     full = shutil._ntuple_diskusage(100, 99, 1)
-    monkeypatch.setattr("clra.app.output_checks.shutil.disk_usage", lambda path: full)
+    monkeypatch.setattr("clra.io.atomic.shutil.disk_usage", lambda path: full)
     refused(clra("reconstruct", scan_file, "-o", tmp_path / "v.h5"), 1, "v.h5", "free some space")
 
 
@@ -375,3 +377,36 @@ def test_demo_shows_that_it_works(clra, monkeypatch, tmp_path):
     assert told["gauge_free_mae_u"] < 0.5 and told["gauge_free_mae_v"] < 1
     names = {file.name for file in (tmp_path / "d").iterdir()}
     assert names == {"scan.nxs", "motion.h5", "before.h5", "after.h5", "report.html"}
+
+
+def test_files_that_are_there_are_kept_where_that_is_wanted(clra, scan_file, tmp_path):
+    out = tmp_path / "v.h5"
+    out.write_text("old")
+    done = clra("reconstruct", scan_file, "-o", out, "--no-overwrite")
+    refused(done, 2, "v.h5", "it is there already", "--no-overwrite")
+    assert out.read_text() == "old" and os.listdir(tmp_path) == ["v.h5"]
+    assert clra("reconstruct", scan_file, "-o", tmp_path / "w.h5", "--no-overwrite")[0] == 0
+
+
+@pytest.mark.filterwarnings("ignore:.*other radiographs")
+def test_outputs_tell_the_command_that_made_them(clra, scan_file, motion_file, record, tmp_path):
+    volume, corrected = tmp_path / "a volume.h5", tmp_path / "c.nxs"
+    for command, out in (("reconstruct", volume), ("correct", corrected)):
+        assert clra(command, scan_file, "-o", out, "--motion", motion_file)[0] == 0
+        with h5py.File(out) as file:
+            told = dict(file.attrs)
+        assert told["command"].startswith(f"clra {command} {scan_file} -o ")
+        assert told["scan_checksum"] == read_scan(scan_file).checksum()
+        assert told["alignment_checksum"] == record.checksum_of_motion()
+
+
+@pytest.mark.filterwarnings("default")
+def test_json_tells_what_was_warned_of(clra, record, scan_file, tmp_path):
+    path = tmp_path / "m.h5"
+    keep_motion(path, record.motion, checksum="sha256:other")
+    options = ("--motion", path, "-o", tmp_path / "c.nxs", "--json")
+    code, out, err = clra("correct", scan_file, *options)
+    assert code == 0, err
+    (told,) = json.loads(out)["warnings"]
+    assert told["code"] == "scan" and "other radiographs" in told["message"]
+    assert told["severity"] == "warning" and told["message"] in err

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from alignments import keep_motion
 
-from clra.io.scan_files import read_scan
+from clra.app.simulation import paper_like
+from clra.errors import ClraWarning
+from clra.io.alignment_file import read_alignment
+from clra.io.scan_files import read_scan, write_scan
 from clra.io.volumes.volume_files import read_volume, write_volume
+from clra.methods.reconstruction.iterative import Multigrid
+from clra.methods.reconstruction.reconstruct import reconstruct
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
+from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.model.scan import Scan
 from clra.ops.streaming.stream import Stream
 from tests.app.test_cli import refused
 
@@ -78,14 +85,13 @@ def test_resumed_to_the_bit(clra, scan_file, tmp_path, stopping):
     done = clra("reconstruct", scan_file, "-o", out, *options)
     refused(done, 130, "volume.h5.resume", "keeps cycle 1 up to HR", "--resume")
     assert not out.exists()
-    half, _ = read_volume(tmp_path / "volume.h5.resume" / "volume.h5")
-    assert half.std() > 0
+    assert np.load(tmp_path / "volume.h5.resume" / "1.npy").std() > 0
     stopping(None)
     done = clra("reconstruct", scan_file, "-o", out, "--method", "imgr", "--resume")
-    refused(done, 2, "motion.h5", "/@settings")
+    refused(done, 2, "state.json", "expected")
     # The file is the same, but it is read with another geometry.
     done = clra("reconstruct", scan_file, "-o", out, *options, "--rotation", "cw", "--resume")
-    refused(done, 2, "motion.h5", "/@settings")
+    refused(done, 2, "state.json", "expected")
     code, told, err = clra("reconstruct", scan_file, "-o", out, *options, "--resume", "--json")
     assert code == 0, err
     assert [step["level"] for step in json.loads(told)["steps"]][:2] == ["HR", "FR"]
@@ -102,7 +108,7 @@ def test_another_motion_is_not_gone_on_with(clra, scan_file, tmp_path, stopping)
     stopping(1)
     assert clra(*options, "--motion", first)[0] == 130
     stopping(None)
-    refused(clra(*options, "--motion", second, "--resume"), 2, "motion.h5", "/@settings")
+    refused(clra(*options, "--motion", second, "--resume"), 2, "state.json", "expected")
     assert clra(*options, "--motion", first, "--resume")[0] == 0
 
 
@@ -111,7 +117,7 @@ def test_another_motion_is_not_gone_on_with(clra, scan_file, tmp_path, stopping)
     [
         (["--subsets", 3], ["subsets", "fbp does not have"]),
         (["--method", "osem-tr", "--levels", "QR-HR-FR"], ["levels", "osem-tr does not have"]),
-        (["--method", "osem-tr", "--resume"], ["--resume", "expected imgr"]),
+        (["--method", "fbp", "--resume"], ["--resume", "expected osem-tr, imgr or --align"]),
         (["--method", "osem-tr", "--update", "newton"], ["update", "'newton'", "paraboloid"]),
         (["--method", "osem-tr", "--i0", -5], ["i0", "found -5", "photons"]),
         (["--method", "osem-tr", "--subsets", 25], ["subsets", "found 25", "at most 24"]),
@@ -127,3 +133,44 @@ def test_wrong_options_are_refused(clra, scan_file, tmp_path, options, parts):
 def test_a_volume_of_other_methods_is_refused(clra, scan_file, tmp_path):
     done = clra("align", scan_file, "-o", tmp_path / "m.h5", "--volume", tmp_path / "v.h5")
     refused(done, 2, "--volume", "expected imgr")
+
+
+def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
+    out, folder = tmp_path / "m.h5", tmp_path / "m.h5.resume"
+    command = ("align", scan_file, "-o", out, "--schedule", "3HR")
+
+    def stop(error):
+        def report(self, stage, done, total):
+            if (folder / "1.npz").exists():
+                raise error
+
+        monkeypatch.setattr(Stream, "report", report)
+
+    stop(MemoryError("too many voxels"))
+    done = clra(*command)
+    refused(done, 1, "too many voxels; ", folder, "keeps 1 iteration, the last at HR, --resume")
+    assert not out.exists()
+    stop(KeyboardInterrupt())
+    refused(clra(*command, "--resume"), 130, out, "keeps what 1 iteration", "--resume goes on")
+    assert len(read_alignment(out).history) == 1
+    monkeypatch.undo()
+    assert clra(*command, "--resume", "--quiet") == (0, "", "")
+    assert len(read_alignment(out).history) == 3 and not folder.exists()
+
+
+@pytest.mark.filterwarnings("default")
+def test_imgr_crops_masked_detectors_and_tells_of_truncation(clra, tmp_path):
+    geometry = paper_like("circular", 24, (24, 33))
+    wide = Ellipsoids([[0.4, 0.2, 0]], [[1.5, 1.5, 1.5]], [0.5]).line_integrals(geometry)
+    mask = np.ones(geometry.shape, np.bool_)
+    mask[:, :4] = False
+    path, out = tmp_path / "masked.nxs", tmp_path / "v.h5"
+    write_scan(path, Scan(wide, geometry, mask=mask))
+    options = ("--method", "imgr", "--levels", "HR-FR")
+    code, _, err = clra("reconstruct", path, "-o", out, *options)
+    assert code == 0 and "reaches beyond the detector" in err
+    volume, grid = read_volume(out)
+    assert grid == default_grid(read_scan(path).cropped().geometry)
+    with pytest.warns(ClraWarning, match="reaches beyond the detector"):
+        expected = reconstruct(read_scan(path), "imgr", options=Multigrid(levels="HR-FR"))
+    np.testing.assert_array_equal(volume, expected)

@@ -3,25 +3,16 @@
 import numpy as np
 import pytest
 
-from clra.app.plausible import doubt_of_shifts, doubt_of_turning
-from clra.methods.alignment.quality import Quality
+from clra.app.plausible import doubt_of_shifts
+from clra.methods.alignment.agreement import Agreement
 from clra.model.motion import Motion
-
-
-@pytest.mark.parametrize(
-    ("sharpening", "doubted"), [(1.3, True), (1.0, False), (0.7, False), (float("nan"), False)]
-)
-def test_the_sense_of_turning_is_doubted_where_the_other_is_sharper(sharpening, doubted):
-    told = doubt_of_turning(sharpening)
-    assert bool(told) == doubted
-    assert not doubted or ("1.30" in told and "--rotation" in told)
 
 
 @pytest.mark.parametrize(
     ("shift_u", "shift_v", "doubted"), [(2.0, 1.0, False), (0.2, 0.1, True), (0.0, 1.0, False)]
 )
 def test_shifts_smaller_than_their_uncertainty_are_doubted(shift_u, shift_v, doubted):
-    quality = Quality(1, 0.6, 0.6, half_u=0.5, half_v=0.2, sharpness=1.0)
+    quality = Agreement(1, 0.6, 0.6, half_u=0.5, half_v=0.2, sharpness=1.0)
     signs = np.array([1, -1, 1, -1, 1])
     told = doubt_of_shifts(quality, Motion(shift_u=shift_u * signs, shift_v=shift_v * signs))
     assert bool(told) == doubted

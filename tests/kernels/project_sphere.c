@@ -4,7 +4,7 @@
  *     cc -I KERNELS project_sphere.c -lOpenCL -lm -o project_sphere
  *     ./project_sphere KERNELS OUT
  *
- * OUT gets float32 (VIEWS, COLUMNS, ROWS) in the machine's byte order. The first device that builds
+ * OUT gets float32 (VIEWS, ROWS, COLUMNS) in the machine's byte order. The first device that builds
  * the kernel is used and named on stdout. Exit status: 0, 1 where something fails, 77 where there
  * is no device that builds it.
  */
@@ -17,7 +17,7 @@
 #include "clra_kernels.h"
 
 enum { VIEWS = 5, COLUMNS = 23, ROWS = 19, N = 21 }; /* N voxels along each axis */
-enum { VIEW_FLOATS = 24, PAD = 24, PITCH = 16 * ((ROWS + 2 * PAD + 15) / 16) }; /* geometry.clh */
+enum { VIEW_FLOATS = 24 }; /* geometry.clh */
 static const double VOXEL = 0.1, SOURCE = 5.0, DETECTOR = 3.0, PIXEL = 0.17; /* mm */
 enum { DIAMETER = 16 }; /* voxels */
 static const float ATTENUATION = 1.0f / 512; /* 1/mm */
@@ -107,7 +107,7 @@ int main(int argc, char **argv)
         return 2;
     }
     static float volume[N * N * N], views[VIEWS * VIEW_FLOATS];
-    static float projections[VIEWS * (COLUMNS + 1) * PITCH];
+    static float projections[VIEWS * ROWS * COLUMNS];
     for (int y = 0; y < N; ++y)
         for (int x = 0; x < N; ++x)
             for (int z = 0; z < N; ++z) { /* twice the distance from the middle, in whole numbers */
@@ -136,7 +136,7 @@ int main(int argc, char **argv)
     cl_mem table = buffer(context, VIEWS * VIEW_FLOATS, views);
 
     const cl_ulong start = 0;
-    const cl_int n = N, columns = COLUMNS, rows = ROWS, pitch = PITCH, count = VIEWS, first = 0;
+    const cl_int n = N, columns = COLUMNS, rows = ROWS, count = VIEWS, accumulate = 0;
     const cl_float voxel = VOXEL;
 #define SET(argument, value)                                                                       \
     check(clSetKernelArg(kernel, CLRA_FORWARD_RAYS_##argument, sizeof(value), &(value)), #argument)
@@ -151,11 +151,9 @@ int main(int argc, char **argv)
     SET(NZ, n);
     SET(COLUMNS, columns);
     SET(ROWS, rows);
-    SET(PITCH, pitch);
     SET(COUNT, count);
-    SET(FROM_PLANE, first);
-    SET(TO_PLANE, n);
     SET(VOXEL_SIZE, voxel);
+    SET(ACCUMULATE, accumulate);
     const size_t size[3] = {ROWS, COLUMNS, VIEWS};
     check(clEnqueueNDRangeKernel(queue, kernel, 3, NULL, size, NULL, 0, NULL, NULL), "enqueue");
     check(clEnqueueReadBuffer(queue, out, CL_TRUE, 0, sizeof projections, projections, 0, NULL, NULL),
@@ -166,9 +164,7 @@ int main(int argc, char **argv)
         perror(argv[2]);
         return 1;
     }
-    for (int view = 0; view < VIEWS; ++view)
-        for (int c = 0; c < COLUMNS; ++c)
-            fwrite(projections + (view * (COLUMNS + 1) + c) * PITCH + PAD, sizeof(float), ROWS, file);
+    fwrite(projections, sizeof(float), VIEWS * ROWS * COLUMNS, file);
     fclose(file);
     clReleaseMemObject(out);
     clReleaseMemObject(in);

@@ -71,7 +71,7 @@ def from_c(program: Path, folder: Path) -> np.ndarray:
         )
         if done.returncode != NO_DEVICE:
             assert done.returncode == 0, done.stderr
-            return np.fromfile(out, np.float32).reshape(VIEWS, COLUMNS, ROWS).transpose(0, 2, 1)
+            return np.fromfile(out, np.float32).reshape(VIEWS, ROWS, COLUMNS)
     pytest.skip(f"the C program: {done.stderr.strip()}")
 
 

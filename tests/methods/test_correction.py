@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import clra
+from clra.methods.alignment.result import AlignmentResult
 from clra.model.phantoms.ellipsoids import Ellipsoids
 
 SHAPE = (45, 53)
@@ -63,3 +64,14 @@ def test_the_parallax_of_a_source_that_moved_stays_and_is_told(geometry, motion)
     scan = clra.Scan(_smooth(geometry.with_motion(moved)), geometry)
     with pytest.warns(UserWarning, match="keeps its parallax"):
         clra.correct(scan, moved)
+
+
+def test_views_that_an_alignment_rejected_are_left_out(geometry, motion):
+    rng = np.random.default_rng(0)
+    pixels = rng.random((geometry.views, *geometry.shape)).astype(np.float32)
+    scan = clra.Scan(pixels, geometry)
+    valid_views = np.arange(geometry.views) != 1
+    part = clra.correct(scan, AlignmentResult.from_motion(motion, valid_views))
+    whole = clra.correct(scan, motion)
+    assert part.views == geometry.views - 1 and part.geometry == geometry.subset(valid_views)
+    np.testing.assert_array_equal(part.read(0, part.views), whole.read(0, whole.views)[valid_views])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clra.model.grid import VolumeGrid, default_grid
+from clra.model.grid import VolumeGrid, default_grid, volume_grid
 from clra.model.motion import Motion
 from clra.model.trajectory import PAPER, circular, helix, space_filling
 
@@ -86,10 +86,12 @@ def test_default_grid_of_a_circle():
     assert grid.centre == (0, 0, 0)
 
 
-def test_default_grid_takes_the_nearer_side_of_an_offset_detector():
-    geometry = circular(8, **CIRCLE)
-    shifted = geometry.with_motion(Motion(shift_u=np.full(8, 7.0), shift_v=np.zeros(8)))
-    half_fan = np.arctan((41 / 2 - 7) * 0.5 / 100)
+@pytest.mark.parametrize(("arc", "shift", "edge"), [(1, 1.5, -1), (0.7, 7, -1), (1, 7, 1)])
+def test_default_grid_takes_the_farther_side_of_an_offset_detector_only(arc, shift, edge):
+    geometry = circular(80, arc=arc * 2 * np.pi, **CIRCLE)
+    moved = Motion(shift_u=np.full(80, float(shift)), shift_v=np.zeros(80))
+    shifted = geometry.with_motion(moved)
+    half_fan = np.arctan((41 / 2 + edge * shift) * 0.5 / 100)
     assert default_grid(shifted).shape[2] == np.ceil(2 * 40 * np.sin(half_fan) / 0.2)
 
 
@@ -168,3 +170,33 @@ def test_scans_without_a_field_of_view_are_refused():
     )
     with pytest.raises(ValueError, match="the axis lies behind the source"):
         default_grid(behind)
+
+
+def test_a_region_has_the_voxels_of_the_whole_grid():
+    geometry = circular(80, **CIRCLE)
+    whole = default_grid(geometry)
+    part = volume_grid(geometry, roi=((-1.1, 2.03), (None, 0.0), (0.7, None)))
+    for axis, all_of_it, (low, high) in zip(
+        part.coordinates(),
+        whole.coordinates(),
+        ((-1.1, 2.03), (-np.inf, 0.0), (0.7, np.inf)),
+        strict=True,
+    ):
+        half = 0.5 * whole.voxel_size
+        inside = all_of_it[(all_of_it + half > low + 1e-6) & (all_of_it - half < high - 1e-6)]
+        assert axis == pytest.approx(inside)
+
+
+def test_another_voxel_covers_the_same_field_of_view():
+    geometry = circular(80, **CIRCLE)
+    whole, fine = default_grid(geometry), volume_grid(geometry, voxel_size=0.07)
+    assert fine.voxel_size == 0.07
+    assert fine.centre == whole.centre
+    for n, m in zip(fine.shape, whole.shape, strict=True):
+        assert m * whole.voxel_size <= n * 0.07 < m * whole.voxel_size + 0.07
+
+
+@pytest.mark.parametrize("ends", [(1.0, 1.0), (2.0, 1.0)])
+def test_a_region_is_not_empty(ends):
+    with pytest.raises(ValueError, match="roi: found y"):
+        volume_grid(circular(8, **CIRCLE), roi=((None, None), ends, (None, None)))

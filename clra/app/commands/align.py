@@ -8,7 +8,6 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.errors import InputError
-from clra.findings import Finding
 
 
 def align(
@@ -37,8 +36,10 @@ def align(
     start: Annotated[
         Path | None,
         typer.Option(
-            metavar="MOTION.h5",
-            help="Motion to start from, of a run that was interrupted or shall be refined.",
+            metavar="MOTION",
+            help="Motion to start from: MOTION.h5 of a run that was interrupted or shall be "
+            "refined, a table as clra export-motion writes it, or what a scanner's software "
+            "measured (.txrm, .pcr, _TS.csv, CTSimU .json).",
         ),
     ] = None,
     autofocus: Annotated[
@@ -71,6 +72,9 @@ def align(
             help="Take out of the motion, or leave in, what a movement of the sample explains.",
         ),
     ] = "anchored",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where this command was interrupted.")
+    ] = False,
     report: Annotated[
         Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
     ] = None,
@@ -82,7 +86,8 @@ def align(
     """Estimate how each radiograph moved.
 
     Writes shift and magnification of every view, how much to trust them, and the history of the
-    run. Ctrl-C keeps what the iterations finished so far gave.
+    run. Whatever interrupts it, finished iterations stay beside the motion, and --resume goes on
+    from there.
 
     Examples
     --------
@@ -94,19 +99,18 @@ def align(
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
       clra align scan.nxs -o motion.h5 --autofocus
     """
-    from clra.app.annotations import annotated
+    from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
-    from clra.app.exit_status import InterruptedCommandError
-    from clra.app.output_checks import focus_attributes, matched
-    from clra.app.plausible import doubt_of_turning
+    from clra.app.exit_status import InterruptedCommandError, keeping
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
+    from clra.io.provenance import provenance
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
-    from clra.methods.alignment.autofocus import sharpening_by_turning_back
-    from clra.methods.alignment.result import AlignmentInterrupted
+    from clra.methods.alignment.result import AlignmentInterrupted, finished
+    from clra.methods.execution.checkpoint import Checkpoint
     from clra.model.grid import default_grid
     from clra.model.schedule import parse_levels, parse_schedule
 
@@ -127,7 +131,8 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    earlier = None if start is None else read_alignment(start)
+    measured = None if start is None else reading.start_motion(start, opened.views)
+    earlier = None if start is None or measured is not None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
     about = {
@@ -139,7 +144,8 @@ def align(
         f"{'' if start is None else f' --start {start}'}"
         f"{' --autofocus' if autofocus else ''}{reading.as_typed()}",
     }
-    with console.progress() as progress:
+    checkpoint = Checkpoint(f"{out}.resume", resume=resume)
+    with console.progress() as progress, keeping(checkpoint):
         if autofocus:
             focus = find_focus(opened, console.device, progress=progress, **limits)
             about |= focus_attributes(focus)
@@ -153,39 +159,31 @@ def align(
                 estimate=estimate,
                 gauge=gauge,
                 reference=still,
-                motion=None if earlier is None else earlier.motion,
+                motion=measured if earlier is None else earlier.motion,
                 device=console.device,
                 progress=progress,
+                checkpoint=checkpoint,
                 **limits,
             )
         except AlignmentInterrupted as stopped:
             result = annotated(stopped.result, opened, earlier, interrupted="yes", **about)
             write_alignment(out, result)
-            last = result.history[-1]
             raise InterruptedCommandError(
-                f"{out} keeps what {len(result.history)} iterations gave, the last at "
-                f"{last.level}; --start {out} goes on from there"
+                f"{out} keeps what {finished(stopped.result.history)} gave; --resume goes on from "
+                f"there, or --start {out}"
             ) from None
         result = annotated(result, opened, earlier, **about)
         write_alignment(out, replace(result, volume=None))
-        turned = sharpening_by_turning_back(
-            opened.cropped(),
-            result.motion.about(*opened.window_offset),
-            console.device,
-            progress=progress,
-            **limits,
-        )
-        more = {"sharpening_by_turning_back": f"{turned:.3f}"}
-        doubt = doubt_of_turning(turned)
-        doubts = [Finding("rotation", doubt)] if doubt else []
-        result = replace(
-            result, about={**result.about, **more}, warnings=(*result.warnings, *doubts)
-        )
-        write_alignment(out, replace(result, volume=None))
+        if volume is None:
+            checkpoint.clear()
         errors = Errors.of(result, opened)
         if volume is not None and result.volume is not None:
             grid = default_grid(opened.cropped().geometry)
-            write_volume(volume, result.volume, grid, progress=progress)
+            made = provenance(
+                command=result.command, scan=opened, alignment=result, method=method, grid=grid
+            )
+            write_volume(volume, result.volume, grid, provenance=made, progress=progress)
+            checkpoint.clear()
         if report is not None:
             from clra.app.report.html_report import write_report
 
@@ -198,10 +196,6 @@ def align(
                 **limits,
             )
             write_report(report, findings)
-            known = {str(finding) for finding in result.warnings}
-            doubts += [Finding("report", note) for note in findings.notes if note not in known]
-    for finding in doubts:
-        finding.warn()
     values, text = summary_of(result, errors)
     beside = {"volume": volume, "report": report}
     written = {"file": out, **{name: path for name, path in beside.items() if path}}

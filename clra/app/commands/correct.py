@@ -31,8 +31,11 @@ def correct(
     --------
       clra correct scan.nxs --motion motion.h5 -o corrected.nxs
     """
-    from clra.app.output_checks import alignment_for, room_for
+    from clra.app.annotations import alignment_for
+    from clra.app.exit_status import command_line
     from clra.app.scan_description import views_flagged
+    from clra.io.atomic import ensure_writable
+    from clra.io.provenance import provenance
     from clra.io.scan_files import write_scan
     from clra.methods.correction import correct as correct_scan
 
@@ -40,10 +43,19 @@ def correct(
     opened = reading.scan(scan)
     opened, alignment = alignment_for(opened, motion, reading.geometry())
     views, rows, columns = opened.shape
-    room_for(out, 4 * views * rows * columns, keep=(scan, motion))
+    ensure_writable(out, (scan, motion), 4 * views * rows * columns)
     with console.progress() as progress:
         corrected = correct_scan(opened, alignment.motion, console.device, **limits)
-        write_scan(out, corrected, valid_views=alignment.valid_views, progress=progress)
+        made = provenance(
+            command=command_line(), scan=opened, alignment=alignment, method="correct"
+        )
+        write_scan(
+            out,
+            corrected,
+            valid_views=alignment.valid_views,
+            provenance=made,
+            progress=progress,
+        )
     invalid = alignment.flagged
     marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
     console.summary(

@@ -1,10 +1,17 @@
 """List and test the OpenCL devices."""
 
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from clra.app.console import Console
+
+if TYPE_CHECKING:
+    from clra.ops.runtime.devices import DeviceInfo
+    from clra.progress import ProgressCallback
 
 
 def devices(
@@ -39,9 +46,70 @@ def devices(
     if not test:
         console.result({"devices": found, "taken": taken[0] if taken else None}, "\n".join(lines))
         return
-    from clra.app.device_table import results, table
-
-    tested = results(found, console.progress)
-    console.result({"devices": tested, "taken": taken[0] if taken else None}, table(tested))
+    tested = _results(found, console.progress)
+    console.result({"devices": tested, "taken": taken[0] if taken else None}, _table(tested))
     if not any(one.passed for one in tested):
         raise typer.Exit(1)
+
+
+@dataclass(frozen=True)
+class _TestedDevice:
+    """A line of the table.
+
+    Attributes
+    ----------
+    index, name, driver : str
+        Which device.
+    passed : bool
+        Whether all answers were right.
+    failure : str
+        What went wrong, in one line.
+    rate : float or None
+        Back-projection, 1e9 voxels times views a second.
+    cpu : str or None
+        CPU name that PoCL's compiler had to be given.
+    """
+
+    index: str
+    name: str
+    driver: str
+    passed: bool
+    failure: str
+    rate: float | None
+    cpu: str | None
+
+
+def _results(
+    found: "Sequence[DeviceInfo]",
+    progress: Callable[[], "AbstractContextManager[ProgressCallback]"],
+) -> list[_TestedDevice]:
+    """Test each device, whatever is known of it from before."""
+    from clra.ops.runtime.devices import device_at
+    from clra.ops.runtime.self_test import verdict
+    from clra.progress import Progress
+
+    tested = []
+    with progress() as report:
+        for number, info in enumerate(found):
+            report(Progress(f"testing {info.name}", number, len(found)))
+            outcome = verdict(device_at(info.index), info.index, anew=True, rate=True)
+            failure = outcome.failure or ("" if outcome.tested else "the test could not run")
+            tested.append(
+                _TestedDevice(
+                    *(info.index, info.name, info.driver, not failure, failure),
+                    *(outcome.rate, outcome.cpu),
+                )
+            )
+    return tested
+
+
+def _table(tested: Sequence[_TestedDevice]) -> str:
+    """Return the lines of the table, with its head."""
+    rows = [("", "device", "driver", "verdict", "G voxel-views/s")]
+    for one in tested:
+        verdict_found = one.failure or ("passes" + (f" as {one.cpu}" if one.cpu else ""))
+        rate = "" if one.rate is None else f"{one.rate:.2g}"
+        rows.append((one.index, one.name, one.driver, verdict_found, rate))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

@@ -1,6 +1,5 @@
 """Make a scan of frames, or of a scanner's files."""
 
-import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,6 +9,7 @@ import typer
 from clra.app.arguments import axis_place, detector, pixel
 from clra.app.console import Console
 from clra.errors import InputError
+from clra.findings import warn
 
 if TYPE_CHECKING:
     from clra.io.scanners.scanner_scan import ScannerScan
@@ -130,7 +130,7 @@ def import_scan(
     Examples
     --------
       clra import Lego.xtekct -o lego.nxs
-      clra import tooth.h5 --parallel --centre-offset -23.5 -o tooth.nxs
+      clra import tooth.h5 --parallel --centre-offset -24 -o tooth.nxs
       clra import 'scan/*.tif' --angles angles.txt --source-distance 4.36
         --detector-distance 432 --pixel-size 0.139 --flat flat.tif --dark dark.tif -o scan.nxs
       clra import frames.raw --shape 3040x3040 --angles 0:359.5:720 --source-distance 7.07
@@ -163,7 +163,7 @@ def import_scan(
         if flat or flat_after or dark:
             given = "--flat, --flat-after or --dark"
             raise InputError.at(scanner.path, given, "frames", "none: they come from the scan")
-        _import_scanner(console, scanner, out, white)
+        _import_scanner(console, scanner, out, flipped=flip is not None)
         return
     if angles is None or size is None:
         missing = "--angles" if angles is None else "--pixel-size"
@@ -206,9 +206,7 @@ def import_scan(
         _warn_of_no_flats(out)
 
 
-def _import_scanner(
-    console: Console, scanner: "ScannerScan", out: Path, white: float | None
-) -> None:
+def _import_scanner(console: Console, scanner: "ScannerScan", out: Path, *, flipped: bool) -> None:
     """Write what a scanner's files hold, and tell what was read and assumed."""
     from clra.app.scan_description import Facts, scanner_text, table
     from clra.io.scan_files import import_scanner
@@ -225,7 +223,7 @@ def _import_scanner(
         },
     }
     text = f"wrote {out}\n{table(facts.lines())}\n\n{scanner_text(scanner)}"
-    if scanner.start_motion is not None:
+    if scanner.start_motion is not None and not flipped:
         text += f"\nnote: clra align {out} --start {scanner.path} starts from its motion"
     console.summary(values, text)
     if not scanner.normalisable(white=None):
@@ -233,8 +231,8 @@ def _import_scanner(
 
 
 def _warn_of_no_flats(out: Path) -> None:
-    warnings.warn(
+    warn(
+        "no-flats",
         f"{out} has no flats: every command that reads it needs --white COUNTS, and 1 if these "
         "radiographs are transmission already",
-        stacklevel=3,
     )

@@ -1,8 +1,7 @@
 """Describe a scan and what it will take."""
 
-import warnings
-
 from clra.app.console import Console, Memory, Reading, ScanPath
+from clra.findings import warn
 
 
 def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> None:
@@ -34,7 +33,7 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
     except DeviceError as error:
         if console.device:
             raise
-        warnings.warn(f"no times: {error}", stacklevel=1)
+        warn("no-times", f"no times: {error}")
         speed = Speed.unknown()
     costs = costs_of(opened.geometry, speed)
     told = "" if scanner is None else f"\n\n{scanner_text(scanner)}"

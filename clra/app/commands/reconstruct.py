@@ -10,14 +10,8 @@ from clra.app.console import Console, Memory, Reading
 from clra.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from clra.methods.reconstruction.imgr_state import ImgrStep
+    from clra.model.geometry import ConeBeamGeometry
     from clra.model.grid import VolumeGrid
-    from clra.model.motion import Motion
-    from clra.model.scan import Scan
-    from clra.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -53,7 +47,7 @@ class Iterating:
         typer.Option(metavar="QR-HR-FR", help="imgr: resolutions of a cycle; ER is an eighth."),
     ] = None
     resume: Annotated[
-        bool, typer.Option("--resume", help="imgr: go on where Ctrl-C stopped this command.")
+        bool, typer.Option("--resume", help="Go on where this command was interrupted.")
     ] = False
 
     def options(self) -> dict[str, Any]:
@@ -62,15 +56,102 @@ class Iterating:
         return {name: value for name, value in given.items() if value is not None}
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """Which voxels, of which pixels."""
+
+    roi: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0:X1,Y0:Y1,Z0:Z1",
+            help="Region to reconstruct, in mm from the axis and the scan's middle height; an end "
+            "that is left out is that of the field of view.",
+        ),
+    ] = None
+    voxel_size: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="Edge of a voxel; by default a pixel seen at the axis."),
+    ] = None
+    bin: Annotated[
+        int, typer.Option(metavar="N", help="Average N x N pixels (and so voxels) first.")
+    ] = 1
+    window: Annotated[
+        str,
+        typer.Option(
+            metavar="ram-lak|shepp-logan|hann",
+            help="fbp: window of the ramp filter, against noise.",
+        ),
+    ] = "ram-lak"
+
+    def options(self) -> dict[str, Any]:
+        """Return what `reconstruct` takes, but for the grid."""
+        from clra.ops.filtering.ramp import WINDOWS
+
+        if self.bin < 1:
+            raise InputError(f"--bin: found {self.bin}, expected 1 or more")
+        if self.window not in WINDOWS:
+            raise InputError(f"--window: found {self.window!r}, expected {', '.join(WINDOWS)}")
+        return {"binning": self.bin, "window": self.window}
+
+    def grid(self, geometry: "ConeBeamGeometry") -> "VolumeGrid":
+        """Return the grid that is asked for."""
+        from clra.app.arguments import region
+        from clra.model.grid import volume_grid
+
+        roi = None if self.roi is None else region("--roi", self.roi)
+        return volume_grid(geometry.binned(self.bin), roi=roi, voxel_size=self.voxel_size)
+
+
+@dataclass(frozen=True)
+class Storing:
+    """How voxels are stored."""
+
+    dtype: Annotated[
+        str,
+        typer.Option(
+            metavar="float32|uint16|uint8", help="Of the voxels; integers with their scale."
+        ),
+    ] = "float32"
+    limits: Annotated[
+        str,
+        typer.Option(
+            metavar="LOW,HIGH|LOW%,HIGH%",
+            help="Values in 1/mm, or percentiles of the voxels, that are the least and the "
+            "greatest integer.",
+        ),
+    ] = "0.01%,99.99%"
+    compress: Annotated[
+        bool, typer.Option("--compress", help="Compress a .h5; .zarr is in any case.")
+    ] = False
+
+    def options(self) -> dict[str, Any]:
+        """Return what `open_volume` takes."""
+        from clra.app.arguments import limits_of_integers
+        from clra.io.volumes.volume_description import TYPES
+
+        if self.dtype not in TYPES:
+            raise InputError(f"--dtype: found {self.dtype!r}, expected one of {', '.join(TYPES)}")
+        limits = limits_of_integers("--limits", self.limits)
+        compression = "gzip" if self.compress else None
+        return {"dtype": self.dtype, "limits": limits, "compression": compression}
+
+
 def reconstruct(
     console: Console,
     reading: Reading,
     memory: Memory,
+    sampling: Sampling,
+    storing: Storing,
     iterating: Iterating,
     scan: Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")],
     out: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="VOLUME", help="Volume to write: .h5 or .tif."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="VOLUME",
+            help="Volume to write: .h5, .tif, .zarr, .nrrd or .raw.",
+        ),
     ],
     method: Annotated[
         str,
@@ -93,24 +174,30 @@ def reconstruct(
     """Reconstruct a volume.
 
     Covers the whole field of view, in 1/mm. The motion goes into the geometry: no radiograph is
-    resampled; with katsevich each is, once. Ctrl-C in imgr keeps the levels finished so far beside
-    the volume, and --resume goes on from there.
+    resampled; with katsevich each is, once. Whatever interrupts osem-tr, imgr or --align, finished
+    passes, levels and iterations stay beside the volume, and --resume goes on from there.
 
     Examples
     --------
       clra reconstruct scan.nxs -o volume.h5 --motion motion.h5
-      clra reconstruct scan.nxs -o volume.tif --align
+      clra reconstruct scan.nxs -o volume.tif --align --dtype uint16
+      clra reconstruct scan.nxs -o part.zarr --motion motion.h5 --roi=-1:1,-1:1,0:0.5
+      clra reconstruct scan.nxs -o overview.h5 --bin 4
       clra reconstruct helix.nxs -o volume.h5 --method katsevich --align
       clra reconstruct scan.nxs -o volume.h5 --method imgr --align
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
     """
+    from clra.app.annotations import alignment_for
     from clra.app.arguments import volume_file
-    from clra.app.output_checks import alignment_for, room_for
+    from clra.app.exit_status import command_line, keeping
     from clra.app.scan_description import metric
+    from clra.io.atomic import ensure_writable
+    from clra.io.provenance import provenance
+    from clra.io.volumes.raw_volume import sidecar
     from clra.io.volumes.volume_files import open_volume
-    from clra.methods.reconstruction.iterative import sorted_options
+    from clra.methods.execution.checkpoint import Checkpoint
+    from clra.methods.reconstruction.iterative import options_for
     from clra.methods.reconstruction.reconstruct import METHODS, reconstruct_into
-    from clra.model.grid import default_grid
 
     volume_file(out)
     limits = memory.limits()
@@ -118,58 +205,56 @@ def reconstruct(
         raise InputError("--motion, --align: found both, expected one of them")
     if method not in METHODS:
         raise InputError(f"--method: found {method!r}, expected one of {', '.join(METHODS)}")
-    if iterating.resume and method != "imgr":
-        raise InputError(f"--resume: found it with --method {method}, expected imgr")
-    options = iterating.options()
+    given = iterating.options()
+    sampled, stored = sampling.options(), storing.options()
     opened = reading.scan(scan)
-    grid = default_grid(opened.cropped().geometry)
+    grid = sampling.grid(opened.cropped().geometry)
     initial = None
-    if options.get("initial") not in (None, "fbp", "uniform"):
-        initial = Path(options["initial"])
-        options["initial"] = _start(initial, grid)
-    sorted_options(method, options)
-    known = valid_views = None
+    if given.get("initial") not in (None, "fbp", "uniform"):
+        initial = Path(given["initial"])
+        given["initial"] = _start(initial, grid)
+    options = options_for(method, given)
+    if iterating.resume and options is None and not align:
+        expected = "osem-tr, imgr or --align"
+        raise InputError(f"--resume: found it with --method {method}, expected {expected}")
+    alignment = None
     if motion is not None:
         opened, alignment = alignment_for(opened, motion, reading.geometry())
-        known, valid_views = alignment.motion, alignment.valid_views
     nz, ny, nx = grid.shape
-    room_for(out, 4 * nz * ny * nx, keep=(scan, motion, initial))
-    steps: tuple[ImgrStep, ...] = ()
-    with console.progress() as progress:
-        if method == "imgr":
-            steps = _imgr(
+    ensure_writable(out, (scan, motion, initial), 4 * nz * ny * nx)
+    if out.suffix.lower() == ".raw":
+        ensure_writable(sidecar(out), (scan, motion, initial))
+    made = provenance(
+        command=command_line(),
+        scan=opened,
+        alignment=alignment,
+        method=method,
+        options=options,
+        grid=grid,
+    )
+    checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
+    with console.progress() as progress, keeping(checkpoint):
+        with open_volume(out, grid, provenance=made, **stored) as target:
+            done = reconstruct_into(
+                target,
                 opened,
-                out,
-                grid,
-                known,
-                valid_views,
-                align,
-                options,
-                iterating.resume,
-                console,
-                progress,
-                limits,
+                method=method,
+                grid=grid,
+                align=align,
+                device=console.device,
+                alignment=alignment,
+                options=options,
+                progress=progress,
+                checkpoint=checkpoint,
+                **sampled,
+                **limits,
             )
-        else:
-            with open_volume(out, grid) as target:
-                reconstruct_into(
-                    target,
-                    opened,
-                    method=method,
-                    grid=grid,
-                    motion=known,
-                    align=align,
-                    valid_views=valid_views,
-                    device=console.device,
-                    progress=progress,
-                    **limits,
-                    **options,
-                )
+        checkpoint.clear()
     values = {"file": out, "shape": grid.shape, "voxel_mm": grid.voxel_size, "units": "1/mm"}
     lines = [f"wrote {out}: {nx} x {ny} x {nz} voxels of {metric(grid.voxel_size)}, in 1/mm"]
-    if steps:
-        values["steps"] = steps
-        lines += [f"  cycle {s.cycle}, {s.level}: misfit {s.misfit:.4g} before" for s in steps]
+    if done.steps:
+        values["steps"] = done.steps
+        lines += [f"  cycle {s.cycle}, {s.level}: misfit {s.misfit:.4g} before" for s in done.steps]
     console.summary(values, "\n".join(lines))
 
 
@@ -182,65 +267,3 @@ def _start(path: Path, grid: "VolumeGrid") -> Any:
     if found.shape != grid.shape:
         raise InputError.at(path, "/volume", f"shape {found.shape}", f"{grid.shape} as of the scan")
     return volume
-
-
-def _imgr(
-    scan: "Scan",
-    out: Path,
-    grid: "VolumeGrid",
-    motion: "Motion | None",
-    valid_views: "NDArray[np.bool_] | None",
-    align: bool,
-    options: dict[str, Any],
-    resume: bool,
-    console: Console,
-    progress: "ProgressCallback",
-    limits: dict[str, Any],
-) -> "tuple[ImgrStep, ...]":
-    """Reconstruct by multigrid iteration, keep what Ctrl-C leaves, or go on from there."""
-    import numpy as np
-
-    from clra.app.exit_status import InterruptedCommandError
-    from clra.app.resuming import SavedState, fingerprint
-    from clra.io.volumes.volume_files import open_volume
-    from clra.methods.reconstruction.imgr import imgr
-    from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
-    from clra.methods.reconstruction.iterative import sorted_options
-    from clra.ops.runtime.devices import usable_devices
-    from clra.ops.streaming.stream import Stream
-
-    osem, cycle = sorted_options("imgr", options)
-    settings = {
-        "align": align,
-        "motion": motion
-        and f"{motion.cause} " + fingerprint(motion.shift_u, motion.shift_v, motion.magnification),
-        "valid_views": None if valid_views is None else fingerprint(valid_views),
-        "grid": fingerprint(np.array([*grid.shape, grid.voxel_size, *grid.centre])),
-        **options,
-    }
-    saved = SavedState(out, scan, settings)
-    stream = Stream(usable_devices(console.device, progress)[0], report=progress, **limits)
-    state = saved.load(stream, grid) if resume else None
-    try:
-        found = imgr(
-            stream,
-            scan,
-            grid,
-            align=align,
-            motion=motion,
-            valid_views=valid_views,
-            truth=scan.truth,
-            osem=osem,
-            state=state,
-            **cycle,
-        )
-    except ReconstructionInterrupted as stopped:
-        saved.save(stopped.state)
-        last = stopped.state.steps[-1]
-        raise InterruptedCommandError(
-            f"{saved.folder} keeps cycle {last.cycle} up to {last.level}, --resume goes on"
-        ) from None
-    with open_volume(out, grid) as target:
-        found.volume.write(target)
-    saved.clear()
-    return found.steps

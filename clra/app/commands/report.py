@@ -31,7 +31,7 @@ def report(
       clra report motion.h5 -o report.html
       clra report motion.h5 -o report.html --scan scan.nxs
     """
-    from clra.app.output_checks import matched
+    from clra.app.annotations import matched
     from clra.app.report.html_report import write_report
     from clra.app.report.summary import findings_of
     from clra.io.alignment_file import read_alignment

@@ -14,7 +14,7 @@ from clra.app.report.before_after import before_and_after
 from clra.app.report.summary import Errors, Findings
 from clra.app.scan_description import listed
 from clra.io.atomic import atomic_path
-from clra.methods.alignment.quality import Quality
+from clra.methods.alignment.agreement import Agreement
 from clra.methods.alignment.result import AlignmentResult, Iteration
 
 _COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
@@ -177,8 +177,8 @@ def _errors(errors: Errors) -> str:
     names = {
         "raw": "mae",
         "gauge-free": "gauge_free_mae",
-        "raw, without flagged views": "believed_mae",
-        "gauge-free, without flagged views": "believed_gauge_free_mae",
+        "raw, without flagged views": "valid_mae",
+        "gauge-free, without flagged views": "valid_gauge_free_mae",
     }
     rows = [
         [told, *(f"{means[f'{name}_{c}']:{form}}" for c, form in _COMPONENTS.items())]
@@ -233,7 +233,7 @@ def _trust(result: AlignmentResult) -> str:
     return page.section("How far to trust it", *parts)
 
 
-def _quality(quality: Quality) -> str:
+def _quality(quality: Agreement) -> str:
     rows = [
         [
             "unexplained part of a radiograph",

@@ -18,7 +18,7 @@ from clra.model.scan import Scan
 
 if TYPE_CHECKING:
     from clra.app.report.comparison import Comparison
-    from clra.methods.alignment.quality import Quality
+    from clra.methods.alignment.agreement import Agreement
     from clra.progress import ProgressCallback
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ class Errors:
         """Mean absolute errors by name; those of valid views where some are not."""
         errors = {"mae": self.raw, "gauge_free_mae": self.gauge_free}
         if not self.valid_views.all():
-            errors |= {f"believed_{name}": of[self.valid_views] for name, of in errors.items()}
+            errors |= {f"valid_{name}": of[self.valid_views] for name, of in errors.items()}
         components = ("u", "v", "magnification")
         return {
             f"{name}_{component}": float(mean)
@@ -91,7 +91,7 @@ class Findings:
         Pictures, where the scan was at hand.
     facts : mapping of str to str
         Of the scan, for reading.
-    quality : Quality, optional
+    quality : Agreement, optional
         What the radiographs alone tell, where the scan was at hand.
     """
 
@@ -99,7 +99,7 @@ class Findings:
     errors: Errors | None = None
     comparison: "Comparison | None" = None
     facts: Mapping[str, str] = field(default_factory=dict)
-    quality: "Quality | None" = None
+    quality: "Agreement | None" = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -139,7 +139,7 @@ def findings_of(
     if scan is None:
         return Findings(result)
     from clra.app.report.comparison import compare, volume_level
-    from clra.methods.alignment.quality import quality
+    from clra.methods.alignment.agreement import agreement
     from clra.ops.streaming.stream import Stream
 
     stream = Stream(
@@ -154,7 +154,7 @@ def findings_of(
         result,
         errors=Errors.of(result, scan),
         comparison=compare(stream, part, motion, result.confidence, result.valid_views, volume),
-        quality=quality(stream, part, motion, volume_level(part), result.valid_views)
+        quality=agreement(stream, part, motion, volume_level(part), result.valid_views)
         if _in_both_halves(result.valid_views)
         else None,
         facts=Facts.of(scan).lines(),
@@ -200,6 +200,7 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "device": result.device,
         "seconds": seconds,
         "history": result.history,
+        "quality": None if result.quality is None else result.quality.as_dict(),
         **(errors.means() if errors else {}),
     }
     lines = {
@@ -224,7 +225,7 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         means = errors.means()
         lines["error"] = _error(means, "", result)
         if result.flagged:
-            lines["not flagged"] = _error(means, "believed_", result)
+            lines["not flagged"] = _error(means, "valid_", result)
     return values, table(lines)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from itertools import pairwise
 from typing import Any
 
@@ -10,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.findings import warn
+from clra.io.damage import readable
 from clra.model.bad_pixels import Patches
 
 Floats = NDArray[np.float32]
@@ -170,6 +171,10 @@ class CountedRadiographs:
 
     def _read(self, start: int, count: int) -> NDArray[Any]:
         """Read consecutive frames as they are; refuse pixels that are no finite numbers."""
+        with readable(self._path):
+            return self._finite(start, count)
+
+    def _finite(self, start: int, count: int) -> NDArray[Any]:
         try:
             counts = np.asarray(self._frames[start : start + count])
         except (OSError, RuntimeError) as error:
@@ -202,7 +207,7 @@ class CountedRadiographs:
             )  # fmt: skip
         if full[worst] and not self._warned:
             self._warned = True
-            warnings.warn(f"{self._path}: {self._field}: {found}: saturated", stacklevel=4)
+            warn("saturation", f"{self._path}: {self._field}: {found}: saturated")
 
 
 def _runs(frames: Frames) -> list[tuple[int, int]]:

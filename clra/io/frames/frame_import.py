@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from clra.errors import InputError
+from clra.findings import warn
 from clra.io.atomic import ensure_writable
 from clra.io.frames.stacks import FrameStack, RawLayout, Source, read_numbers, warn_of_gaps
 from clra.io.nxtomo.clra_group import KINDS
@@ -164,9 +164,9 @@ def import_frames(
             raise InputError.at("--rotation", "rotation", repr(rotation), "ccw or cw")
         degrees = read_numbers(angles, "angles", views, told)
         if views > 2 and np.ptp(degrees) < _NARROW:
-            warnings.warn(
+            warn(
+                "import",
                 f"angles go from {degrees.min():g} to {degrees.max():g}, and are taken as degrees",
-                stacklevel=2,
             )
         turn = np.deg2rad(degrees)
         propagation = None

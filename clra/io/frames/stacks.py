@@ -6,11 +6,11 @@ import glob
 import math
 import os
 import re
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import tifffile
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
+from clra.findings import warn
 
 Floats = NDArray[np.float64]
 Source = str | os.PathLike[str]
@@ -114,6 +115,7 @@ class FrameStack:
         self.dtype = first.dtype.newbyteorder("=")
         self.shape = (int(self._ends[-1]), *first.shape[1:])
         self._current: _File | None = None
+        self._lock = Lock()  # devices read their views in threads of their own
 
     def __getitem__(self, index: slice) -> NDArray[Any]:
         """Read some consecutive frames."""
@@ -122,10 +124,11 @@ class FrameStack:
         for k, frame in enumerate(chosen):
             which = int(np.searchsorted(self._ends, frame, side="right"))
             path = self.files[which]
-            if self._current is None or self._current.path != path:
-                self.close()
-                self._current = self._open(path)
-            out[k] = self._current.read(frame - int(self._ends[which - 1] if which else 0))
+            with self._lock:
+                if self._current is None or self._current.path != path:
+                    self.close()
+                    self._current = self._open(path)
+                out[k] = self._current.read(frame - int(self._ends[which - 1] if which else 0))
         return out
 
     def close(self) -> None:
@@ -253,11 +256,11 @@ def warn_of_gaps(files: Sequence[Path]) -> None:
     gaps = [k for k, step in enumerate(steps) if step != usual]
     if gaps:
         k = gaps[0]
-        warnings.warn(
+        warn(
+            "missing-frames",
             f"{files[k].name} is followed by {files[k + 1].name}"
             f"{f', and {len(gaps) - 1} more such' if gaps[1:] else ''}: are frames missing or out "
             "of order? Angles go with frames as they come; a pattern in quotes sorts by number",
-            stacklevel=3,
         )
 
 

@@ -28,17 +28,17 @@ def scan_entry(file: h5py.File, name: str | None) -> h5py.Group:
         group = find(file, name)
         if isinstance(group, h5py.Group):
             return group
-        listed = ", ".join(entries) or "none"
+        listed = ", ".join(map(text, entries)) or "none"
         raise InputError.at(file.filename, "entry", repr(name), f"one of: {listed}")
     named = {n: g for n, g in entries.items() if _definition(g) == "NXtomo"}
     entries = named or entries
     if not entries:
-        found = f"groups {', '.join(file) or 'none'}"
+        found = f"groups {', '.join(map(text, file)) or 'none'}"
         raise InputError.at(
             file.filename, "/", found, "an NXtomo entry with instrument/detector/data"
         )
     if len(entries) > 1:
-        listed = ", ".join(entries)
+        listed = ", ".join(map(text, entries))
         raise InputError.at(
             file.filename,
             "/",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import h5py
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.findings import warn
 from clra.io.hdf5 import angles, find, lengths, require
 from clra.io.nxtomo.geometry_fields import Fields, far_source_distance
 
@@ -163,7 +163,7 @@ def _positive(dataset: h5py.Dataset) -> float:
         raise InputError.at(dataset.file.filename, dataset.name, f"{value:g} mm", "above 0 mm")
     if value > _LARGEST:
         name = f"{dataset.file.filename}: {dataset.name}"
-        warnings.warn(f"{name}: {value:g} mm: are the units right, or missing?", stacklevel=4)
+        warn("units", f"{name}: {value:g} mm: are the units right, or missing?")
     return value
 
 
@@ -182,9 +182,9 @@ def _warn_of_unused(detector: h5py.Group) -> None:
             if isinstance(turns.get(name), h5py.Dataset) and np.any(turns[name][()])
         ]
     if told:
-        warnings.warn(
+        warn(
+            "units",
             f"{detector.file.filename}: {detector.name}: {', '.join(told)} not used: row 0 is "
             "taken as the top, columns as counted to the right seen from the source, and the axis "
             "where x_translation puts it",
-            stacklevel=5,
         )

@@ -9,16 +9,18 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+import clra
 from clra.errors import InputError
 from clra.io.atomic import atomic_path
 from clra.io.nxtomo.clra_group import KIND_ATTRIBUTE, KINDS, write_additions
 from clra.io.nxtomo.geometry_fields import Fields, fields_of, top_down
 from clra.io.nxtomo.reader import DARK, FLAT, INVALID, PROJECTION
+from clra.io.provenance import Provenance
 from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Projections
-from clra.model.validation import believed_views
+from clra.model.validation import checked_valid_views
 from clra.progress import ProgressCallback, tell
 
 Views = NDArray[np.intp]
@@ -47,6 +49,7 @@ def write_nxtomo(
     valid_views: NDArray[np.bool_] | None = None,
     fields: Fields | None = None,
     propagation_distance: float | None = None,
+    provenance: Provenance | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write a scan as NXtomo; the file appears whole or not at all.
@@ -81,6 +84,8 @@ def write_nxtomo(
         The geometry in NXtomo's terms, where it came from them; else they are worked out.
     propagation_distance : float, optional
         From sample to detector [mm], where a parallel beam leaves it out of the geometry.
+    provenance : mapping of str to str, optional
+        Attributes of the root: where the scan comes from. The version of clra is kept in any case.
     progress : callable, optional
         Called with a ``Progress`` as frames are written.
 
@@ -103,7 +108,7 @@ def write_nxtomo(
             raise InputError(f"frames: found shape {part.shape}, expected (n, *{geometry.shape})")
     if valid_views is None:
         valid_views = np.ones(geometry.views, np.bool_)
-    valid_views = believed_views(valid_views, geometry.views)
+    valid_views = checked_valid_views(valid_views, geometry.views)
     pixels = np.dtype(dtype if dtype is not None else radiographs[0:1].dtype).newbyteorder("=")
     roles = np.concatenate([np.full(part.shape[0], role, np.int32) for role, part in parts])
     views = np.flatnonzero(roles == PROJECTION)
@@ -125,6 +130,7 @@ def write_nxtomo(
     with atomic_path(path, size) as temporary:
         with h5py.File(temporary, "w") as file:
             entry = _group(file, "entry", "NXentry")
+            file.attrs.update({"clra_version": clra.__version__, **(provenance or {})})
             file.attrs["default"] = "entry"
             data, offset = _detector(entry, fields, roles, views, shape, pixels)
             data.attrs[KIND_ATTRIBUTE] = kind

@@ -66,11 +66,8 @@ def read_ctsimu(path: Path, options: ScannerOptions) -> ScannerScan:
     else:
         scenario, metadata = told, _metadata_of(path)
     detector = scenario.need("detector")
-    shape = (
-        int(detector.need("rows").number()),
-        int(detector.need("columns").number()),
-    )
-    views = int(scenario.need("acquisition", "number_of_projections").number())
+    shape = (detector.need("rows").whole(), detector.need("columns").whole())
+    views = scenario.need("acquisition", "number_of_projections").whole()
     real, known = (_geometry(scenario, views, shape, known_only=k) for k in (False, True))
     truth, findings = _hidden_motion(real, known)
     if metadata is None:
@@ -108,13 +105,13 @@ def _geometry(
     pitch = scenario.need("detector", "pixel_pitch")
     width, height = pitch.need("u").number("mm"), pitch.need("v").number("mm")
     rows = []
-    for stage, source, panel in zip(stages, sources, detectors, strict=True):
+    for stage, source, detector in zip(stages, sources, detectors, strict=True):
         rows.append(
             [
                 stage.axes @ (source.centre - stage.centre),
-                stage.axes @ (panel.centre - stage.centre),
-                stage.axes @ panel.axes[0] * width,
-                stage.axes @ panel.axes[1] * height,
+                stage.axes @ (detector.centre - stage.centre),
+                stage.axes @ detector.axes[0] * width,
+                stage.axes @ detector.axes[1] * height,
             ]
         )
     return ConeBeamGeometry.from_astra(np.array(rows).reshape(views, 12), shape)
@@ -139,6 +136,8 @@ def _hidden_motion(
     points = half * (np.indices((3, 3, 3)).reshape(3, -1).T - 1.0)
     middle = np.array([(known.columns - 1) / 2, (known.rows - 1) / 2])
     ideal, moved = (g.project(points) - middle for g in (known, real))
+    if not np.isfinite([moved, ideal]).all():
+        raise InputError("geometry: found a source among what the detector sees, expected it apart")
     if np.abs(moved - ideal).max() < _NONE:
         return None, ()
     fitted, rest = [], 0.0

@@ -11,6 +11,7 @@ over the scan and interpolated.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
-from clra.io.key_value_text import read_text
+from clra.io.key_value_text import MOST, read_text
 
 Floats = NDArray[np.float64]
 
@@ -102,7 +103,23 @@ class Json:
             unit, value = value.get("unit") or unit, value.get("value")
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError.at(self.path, self.where, repr(value), "a number")
+        if not math.isfinite(value):
+            raise InputError.at(self.path, self.where, value, "a finite number")
         return float(value) * self.factor(unit)
+
+    def whole(self) -> int:
+        """Return a whole number above 0, of views or pixels.
+
+        Raises
+        ------
+        InputError
+            If it is none.
+        """
+        value = self.number()
+        if not 1 <= value <= MOST or value != int(value):
+            expected = f"a whole number of 1 to {MOST}"
+            raise InputError.at(self.path, self.where, f"{value:g}", expected)
+        return int(value)
 
     def factor(self, unit: str | None) -> float:
         """Return the factor from a unit to mm or rad."""
@@ -225,9 +242,6 @@ def _drift(amount: Json, native: str, progress: float, known_only: bool) -> floa
         values = [item.number() for item in drift.need("value").items()]
         factor = drift.factor(drift.unit(amount.unit(native)))
         place = progress * (len(values) - 1)
-        smooth = drift.get("interpolation")
-        if smooth is not None and smooth.value is False:
-            place = np.floor(place)
         total += factor * float(np.interp(place, np.arange(len(values)), values))
     return total
 

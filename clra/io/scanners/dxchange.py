@@ -47,7 +47,7 @@ def is_dxchange(path: Path) -> bool:
             return False
         with h5py.File(path, "r") as file:
             return "exchange/data" in file
-    except (OSError, RuntimeError):
+    except (OSError, RuntimeError, KeyError):
         return False
 
 
@@ -85,13 +85,13 @@ def read_dxchange(path: Path, options: ScannerOptions) -> ScannerScan:
     if options.centre_offset is None:
         findings.append(assumed("the axis in the middle of the columns", "--centre-offset PIXEL"))
     parallel = options.parallel or options.source_distance == float("inf")
-    pixel = options.pixel(_pixel(file, path, options, parallel, findings))
     near, behind = options.source_distance or 0.0, options.detector_distance or 0.0
     if not parallel and not (near and behind):
         raise InputError.at(
             path, "distances", "none in a Data Exchange file",
             "--parallel, or in clra import --source-distance, --detector-distance and --pixel-size",
         )  # fmt: skip
+    pixel = options.pixel(_pixel(file, path, options, parallel, findings))
     degrees = options.degrees(told, path)
     geometry = stage_geometry(
         degrees,

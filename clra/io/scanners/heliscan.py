@@ -5,8 +5,9 @@ far as known: ``expt*.in`` has a key and its value a line, in sections from ``Be
 ``EndSection``; ``rawfiles_KF0000/expt_KF000000.raw`` and so on are radiographs, ``expt_CF*`` frames
 of the open beam, ``expt_DF*`` without beam, uint16, little-endian, row by row. camera_length is the
 distance from the source to the detector, specimen_distance to the axis, pixel_size_x of the
-detector, all taken as mm. How rows and columns are told is not known: ``--shape`` does, or frames
-are square.
+detector, all taken as mm. How rows and columns are told is not known: they are ``--shape``, or two
+whole numbers of the file whose keys speak of rows (row, y, height) and columns and whose product is
+a frame's size, or frames are square.
 
 Angles and heights of the views are not public: they come from tables (``--angles``,
 ``--z-translation``). Row 0 is taken as the top, columns as counted to the right seen from the
@@ -16,10 +17,15 @@ source, angles as counter-clockwise of the sample seen from above, heights as ra
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
+
+import numpy as np
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.frames.frame_views import MissingFrames
+from clra.io.frames.numbered_files import frames_or_missing, numbered_files, stack_or_none
 from clra.io.frames.stacks import RawLayout
 from clra.io.key_value_text import KeyValueText
 from clra.io.scanners.scanner_options import ScannerOptions
@@ -27,9 +33,6 @@ from clra.io.scanners.scanner_scan import (
     ScannerScan,
     assembled,
     assumed,
-    frames_or_missing,
-    numbered_files,
-    stack_or_none,
     unverified,
 )
 from clra.io.scanners.stage import stage_geometry
@@ -40,6 +43,7 @@ _DETAILS = (
 )  # fmt: skip
 # Voxels that differ from pixel and distances by more than this part are told of.
 _UNLIKE = 0.02
+_OF_ROWS = re.compile(r"row|height|vert|(^|_)[yv](_|$)")
 
 
 def read_heliscan(path: Path, options: ScannerOptions) -> ScannerScan:
@@ -50,12 +54,13 @@ def read_heliscan(path: Path, options: ScannerOptions) -> ScannerScan:
     path : Path
         The file.
     options : ScannerOptions
-        What the user says: ``angles`` always, ``z_translation`` for a helix, ``shape``.
+        What the user says: ``angles`` always, ``z_translation`` for a helix, ``shape``. Without
+        angles the scan can be described, but pixels are refused.
 
     Raises
     ------
     InputError
-        If a key is missing or makes no sense, angles are not given, or frames do not fit.
+        If a key is missing or makes no sense, or frames do not fit.
     """
     text = KeyValueText.read(path, " ")
     near, far = options.distances(
@@ -64,9 +69,18 @@ def read_heliscan(path: Path, options: ScannerOptions) -> ScannerScan:
     across = text.number("pixel_size_x", positive=True)
     width, height = options.pixel((across, text.number("pixel_size_y", default=across)))
     files = {role: _frames(path.parent, role) for role in ("KF", "CF", "DF")}
-    degrees = options.degrees(None, path)
-    shape = options.shape or _square(files["KF"], path)
+    shape = options.shape or _shape(text, files["KF"])
     layout = RawLayout(shape=shape)
+    known = options.angles is not None
+    views = max(len(files["KF"]), 1)
+    degrees = options.degrees(None if known else 360.0 / views * np.arange(views), path)
+    if known:
+        expected = "rawfiles_KF0000/expt_KF000000.raw"
+        frames = frames_or_missing(files["KF"], (len(degrees), *shape), path, expected, layout)
+    else:
+        # Described they may be, but not reconstructed.
+        reason = "found none in this format, expected --angles FILE"
+        frames = MissingFrames((views, *shape), f"{path}: angles: {reason}")
     heights = options.heights(len(degrees))
     findings = [
         unverified("angles turn counter-clockwise seen from above", "--rotation cw"),
@@ -74,6 +88,10 @@ def read_heliscan(path: Path, options: ScannerOptions) -> ScannerScan:
         assumed("lengths in mm", "--source-distance, --detector-distance, --pixel-size"),
         *_voxel(text, width * near / far),
     ]
+    if not known:
+        findings.append(
+            Finding("angles", "angles are not in this format: a turn is drawn", "--angles FILE")
+        )
     if heights is None:
         findings.append(
             Finding(
@@ -94,9 +112,7 @@ def read_heliscan(path: Path, options: ScannerOptions) -> ScannerScan:
         format="HeliScan",
         path=path,
         geometry=geometry,
-        frames=frames_or_missing(
-            files["KF"], (len(degrees), *shape), path, "rawfiles_KF0000/expt_KF000000.raw", layout
-        ),
+        frames=frames,
         kind="counts",
         flats=stack_or_none(files["CF"], layout),
         darks=stack_or_none(files["DF"], layout),
@@ -112,14 +128,21 @@ def _frames(folder: Path, role: str) -> list[Path]:
     return [f for place in places for _, f in numbered_files(place, rf"expt_{role}(\d+)\.raw")]
 
 
-def _square(files: list[Path], path: Path) -> tuple[int, int]:
-    """Rows and columns of frames that are square."""
+def _shape(text: KeyValueText, files: list[Path]) -> tuple[int, int]:
+    """Rows and columns, by numbers of the file that make up a frame, or of square frames."""
     pixels = files[0].stat().st_size // 2 if files else 0
+    numbers: dict[bool, set[int]] = {False: set(), True: set()}
+    for key, value in text.sections[""].items():
+        if value.isdigit() and 0 < int(value) <= pixels:
+            numbers[bool(_OF_ROWS.search(key))].add(int(value))
+    pairs = {(r, c) for r in numbers[True] for c in numbers[False] if r * c == pixels}
     edge = math.isqrt(pixels)
-    if not pixels or edge * edge != pixels:
+    if pixels and edge * edge == pixels:
+        pairs = pairs or {(edge, edge)}
+    if len(pairs) != 1:
         found = f"{pixels} pixels a frame" if files else "no frames"
-        raise InputError.at(path, "rows and columns", found, "--shape ROWSxCOLUMNS")
-    return edge, edge
+        raise InputError.at(text.path, "rows and columns", found, "--shape ROWSxCOLUMNS")
+    return pairs.pop()
 
 
 def _voxel(text: KeyValueText, voxel: float) -> list[Finding]:

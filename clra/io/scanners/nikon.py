@@ -26,14 +26,13 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.frames.numbered_files import frames_or_missing, numbered_files, present_views
 from clra.io.key_value_text import KeyValueText, read_table, read_text
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     ScannerScan,
     assembled,
     assumed,
-    frames_or_missing,
-    numbered_files,
     unverified,
 )
 from clra.io.scanners.stage import stage_geometry
@@ -70,7 +69,12 @@ def read_nikon(path: Path, options: ScannerOptions) -> ScannerScan:
         text.number("SrcToObject", positive=True), text.number("SrcToDetector", positive=True)
     )
     told, findings = _angles(text)
-    degrees = options.degrees(told, path)
+    name = text.find("InputName", "Name") or path.stem
+    folder = path.parent / (text.find("InputFolderName") or "")
+    # The separator may or may not be part of the name.
+    files = numbered_files(folder, rf"{re.escape(name)}[ _-]?(\d+)\.tiff?")
+    index, lost = present_views([number for number, _ in files], 1, len(told))
+    degrees = options.degrees(told[index], path)
     offset, roll = _axis(text, near / far, shape[0] * height)
     principal = (
         -text.number("DetectorOffsetX", default=0.0) / width,
@@ -91,18 +95,20 @@ def read_nikon(path: Path, options: ScannerOptions) -> ScannerScan:
         roll=roll,
         parallel=options.parallel,
     )
-    name = text.find("InputName", "Name") or path.stem
-    folder = path.parent / (text.find("InputFolderName") or "")
-    # The separator may or may not be part of the name.
-    files = numbered_files(folder, rf"{re.escape(name)}[ _-]?(\d+)\.tiff?")
     expected = f"{name}_0001.tif and so on in {folder}"
     frames = frames_or_missing([f for _, f in files], (len(degrees), *shape), path, expected)
     findings += [
+        *lost,
         unverified("clockwise from above, columns to the left", "--rotation ccw or --flip columns"),
-        unverified(f"axis {offset:g} mm along the columns (ObjectOffsetX)", "--centre-offset"),
+        unverified(
+            f"axis {offset:g} mm along the columns (ObjectOffsetX)",
+            f"--centre-offset {offset / width * far / near:.4g}",
+        ),
     ]
     if roll or text.number("ObjectTilt", default=0.0):
-        findings.append(unverified("ObjectRoll and ObjectTilt", "--flip"))
+        findings.append(
+            unverified("ObjectRoll and ObjectTilt", "clra align --autofocus", "measures the roll")
+        )
     scan = ScannerScan(
         format="Nikon XTek",
         path=path,

@@ -27,14 +27,13 @@ import numpy as np
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.frames.numbered_files import frames_or_missing, numbered_files, present_views
 from clra.io.key_value_text import KeyValueText, read_table
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     ScannerScan,
     assembled,
     assumed,
-    frames_or_missing,
-    numbered_files,
     unverified,
 )
 from clra.io.scanners.stage import Floats, stage_geometry
@@ -82,12 +81,15 @@ def read_phoenix(path: Path, options: ScannerOptions) -> ScannerScan:
         text.whole("DimX", section="Image", default=columns),
     )
     files = numbered_files(path.parent, rf"{re.escape(path.stem)}[ _]?(\d+)\.tiff?")
-    views = len(files) or text.whole("NumberImages", section="CT")
+    planned = text.whole("NumberImages", section="CT")
+    # There may be one more, at the end of the turn.
+    views = max(planned, len(files))
+    numbers = [number for number, _ in files]
+    index, findings = present_views(numbers, min([1, *numbers]), views)
     sector = text.number("RotationSector", section="CT", default=360.0)
     table = _positions(path.with_suffix(".pcp"))
-    findings = []
     if table is None:
-        told = sector / text.whole("NumberImages", section="CT") * np.arange(views)
+        told = sector / planned * index
         white: float | Floats = text.number("FreeRay", section="Image", positive=True)
         findings.append(assumed(f"even steps over {sector:g} degrees: no .pcp", "--angles"))
     else:
@@ -95,7 +97,7 @@ def read_phoenix(path: Path, options: ScannerOptions) -> ScannerScan:
             raise InputError.at(
                 path.with_suffix(".pcp"), "rows", len(table), f"{views}, one a radiograph"
             )
-        told, white = table[:views, 0], table[:views, 1]
+        told, white = table[index, 0], table[index, 1]
     degrees = options.degrees(told, path)
     middle = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     principal = (
@@ -115,7 +117,7 @@ def read_phoenix(path: Path, options: ScannerOptions) -> ScannerScan:
         parallel=options.parallel,
     )
     optimised = path.with_suffix(".pcr")
-    motion = optimiser_motion(optimised, len(degrees)) if optimised.is_file() else None
+    motion = optimiser_motion(optimised, views).subset(index) if optimised.is_file() else None
     scan = ScannerScan(
         format="phoenix datos|x",
         path=path,

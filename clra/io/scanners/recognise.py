@@ -72,6 +72,7 @@ _COMPANIONS: tuple[tuple[re.Pattern[str], Callable[[Path], Path]], ...] = (
         lambda path: path.with_name(f"{path.name[: -len('_TS.csv')]}.log"),
     ),
 )
+_HDF5 = (".nxs", ".nx", ".h5", ".hdf5", ".hdf", ".nexus")
 _FRAMES = (".tif", ".tiff", ".raw", ".bin")
 NXTOMO = "NXtomo (.nxs, .h5)"
 
@@ -117,9 +118,7 @@ def recognise(path: str | os.PathLike[str]) -> tuple[Format, Path] | None:
             f"{place}: found frames, expected the metadata of a scanner or an NXtomo file; "
             "clra import makes one of frames and a table of angles"
         )
-    with place.open("rb") as stream:
-        start = stream.read(8)
-    if start == b"\x89HDF\r\n\x1a\n":
+    if suffix in _HDF5 or _is_hdf5(place):
         return None
     raise InputError.at(place, "format", f"suffix {suffix!r}", f"one of {formats_read()}")
 
@@ -150,7 +149,13 @@ def read_scanner(
     if found is None:
         return None
     each, place = found
-    return each.read(place, options or ScannerOptions())
+    try:
+        return each.read(place, options or ScannerOptions())
+    except InputError as error:
+        # What a geometry refuses does not know whence it came.
+        if str(place.parent) in str(error) or str(error).startswith("--"):
+            raise
+        raise InputError(f"{place}: {error}") from error
 
 
 def read_start_motion(
@@ -193,6 +198,21 @@ def read_start_motion(
     if views is not None and motion.views != views:
         raise InputError.at(place, "start motion", f"{motion.views} views", f"{views}")
     return motion
+
+
+def _is_hdf5(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(8) == b"\x89HDF\r\n\x1a\n"
+    except OSError:
+        return True  # whoever opens it tells why it cannot be read
+
+
+def holds_start_motion(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a path is a scanner's, so that `read_start_motion` may find something there."""
+    place = Path(path)
+    alone = place.suffix.lower() == ".pcr" or place.name.lower().endswith("_ts.csv")
+    return (alone and place.is_file()) or recognise_or_none(place) is not None
 
 
 def recognise_or_none(path: Path) -> tuple[Format, Path] | None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,17 +20,14 @@ from clra.io.frames.frame_views import (
     divided,
     mirrored,
 )
-from clra.io.frames.stacks import FrameStack, RawLayout
 from clra.io.scanners.scanner_options import ScannerOptions
-from clra.model.detector_pose import with_axis_at
+from clra.model.detector_pose import flipped, mirrored_axes, reversed_axes, with_axis_at
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.image_flip import flipped, mirrored_axes, reversed_axes
 from clra.model.motion import Motion
 from clra.model.rotation_sense import opposite_rotation
 from clra.model.scan import Scan
 
 Frames = Any
-TIFF_LAYOUT = RawLayout()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +95,9 @@ class ScannerScan:
     def scan(self, white: float | None = None) -> Scan:
         """Return the scan; counts become transmission as those of an NXtomo file do.
 
+        What was found that may spoil a result is warned of; all of it is among the notes of the
+        projections.
+
         Parameters
         ----------
         white : float, optional
@@ -110,6 +108,8 @@ class ScannerScan:
         InputError
             If counts have neither flats nor `white`.
         """
+        for finding in self.findings:
+            finding.warn()
         projections = self.frames if self.missing else self._transmission(white)
         return Scan(
             projections,
@@ -159,7 +159,7 @@ class ScannerScan:
         darks = 0 if self.darks is None else self.darks.shape[0]
         count = before + views + sum(part.shape[0] for part in after)
         roles = np.arange(count)
-        return CountedRadiographs(
+        found = CountedRadiographs(
             FrameSequence([*first, self.radiographs(), *after]),
             path=os.fspath(self.path),
             views=roles[before : before + views],
@@ -168,6 +168,8 @@ class ScannerScan:
             white=white,
             normalised=self.kind != "counts",
         )
+        found.notes = (*map(str, self.findings), *found.notes)
+        return found
 
 
 def assembled(scan: ScannerScan, options: ScannerOptions, *, rotation: str) -> ScannerScan:
@@ -194,6 +196,13 @@ def assembled(scan: ScannerScan, options: ScannerOptions, *, rotation: str) -> S
         raise InputError.at(
             scan.path, "radiographs", found, "{} of {} x {} pixels".format(*expected)
         )
+    near, far = (
+        float(np.median(getattr(geometry, name)))
+        for name in ("source_to_axis", "source_to_detector")
+    )
+    if far < near * (1 - 1e-9) or near <= 0:
+        found = f"{near:g} mm to the axis, {far:g} mm to the detector"
+        raise InputError.at(scan.path, "distances", found, "an axis before the detector")
     if options.rotation is not None and options.rotation != rotation:
         geometry = opposite_rotation(geometry)
     if options.flip is not None:
@@ -247,74 +256,23 @@ def _without_return(scan: ScannerScan) -> ScannerScan:
     )
 
 
-def unverified(what: str, option: str) -> Finding:
+def unverified(what: str, option: str, effect: str = "turns it") -> Finding:
     """Return the finding that a sign is not verified on a real scan, and what turns it.
 
     Parameters
     ----------
     what : str
         Which sign, and how it was taken.
-    option : str
-        The option that turns it.
+    option, effect : str
+        The option, and what it does about it.
     """
-    return Finding(
-        "unverified-sign", f"sign not verified on a real scan: {what}", f"{option} turns it", "info"
-    )
+    message = f"sign not verified on a real scan: {what}"
+    return Finding("unverified-sign", message, f"{option} {effect}", "info")
 
 
 def assumed(what: str, advice: str = "") -> Finding:
     """Return the finding that something the metadata do not tell was assumed."""
     return Finding("assumed", f"assumed: {what}", advice, "info")
-
-
-def numbered_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
-    """Return the files of a folder whose names match, with the number in the first group, sorted.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to look; there may be no such folder.
-    pattern : str
-        Regular expression of whole names, upper and lower case alike.
-    """
-    expression = re.compile(pattern, re.IGNORECASE)
-    names = sorted(os.listdir(folder)) if folder.is_dir() else []
-    matches = [(expression.fullmatch(name), name) for name in names]
-    return sorted((int(match[1]), folder / name) for match, name in matches if match)
-
-
-def frames_or_missing(
-    files: Iterable[Path],
-    shape: tuple[int, int, int],
-    path: Path,
-    expected: str,
-    layout: RawLayout = TIFF_LAYOUT,
-) -> Frames:
-    """Return the frames in files, or a stand-in where there are none.
-
-    Parameters
-    ----------
-    files : iterable of Path
-        In the order of the views.
-    shape : (int, int, int)
-        Of the radiographs, as the metadata tell it.
-    path : Path
-        The metadata.
-    expected : str
-        Which files were looked for.
-    layout : RawLayout
-        Of headerless files.
-    """
-    found = list(files)
-    if not found:
-        return MissingFrames(shape, f"{path}: radiographs: found none, expected {expected}")
-    return FrameStack(found, layout)
-
-
-def stack_or_none(files: Iterable[Path], layout: RawLayout = TIFF_LAYOUT) -> FrameStack | None:
-    """Return the frames in files, or None where there are none."""
-    found = list(files)
-    return FrameStack(found, layout) if found else None
 
 
 def _even(white: float, frames: Frames) -> NDArray[Any]:

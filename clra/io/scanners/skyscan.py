@@ -26,14 +26,13 @@ import numpy as np
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.frames.numbered_files import frames_or_missing, numbered_files, present_views
 from clra.io.key_value_text import KeyValueText, read_table, read_text
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     ScannerScan,
     assembled,
     assumed,
-    frames_or_missing,
-    numbered_files,
     unverified,
 )
 from clra.io.scanners.stage import stage_geometry
@@ -76,7 +75,10 @@ def read_skyscan(path: Path, options: ScannerOptions) -> ScannerScan:
     views = text.whole("Number of Files")
     step = text.number("Rotation Step (deg)", positive=True)
     start = text.number("Scanning Start Angle", default=0.0)
-    degrees = options.degrees(start + step * np.arange(views), path)
+    prefix = text.find("Filename Prefix") or path.stem
+    files = numbered_files(path.parent, rf"{re.escape(prefix)}(\d+)\.tiff?")
+    index, lost = present_views([number for number, _ in files], 0, views)
+    degrees = options.degrees(start + step * index, path)
     direction = (text.find("Rotation Direction") or "CC").upper()
     rotation = "cw" if direction.startswith("CW") else "ccw"
     line = text.number("Optical Axis (line)", default=(shape[0] - 1) / 2)
@@ -92,16 +94,16 @@ def read_skyscan(path: Path, options: ScannerOptions) -> ScannerScan:
         heights=options.heights(len(degrees)),
         parallel=options.parallel,
     )
-    prefix = text.find("Filename Prefix") or path.stem
-    files = numbered_files(path.parent, rf"{re.escape(prefix)}(\d+)\.tiff?")
     expected = f"{prefix}0000.tif and so on beside it"
     corrected = (text.find("Flat Field Correction") or "").upper().startswith("ON")
     bits = text.whole("Depth (bits)", default=16)
     white = options.white or text.number("Reference Intensity", default=float(2**bits - 1))
     shifts = path.with_name(f"{path.stem}_TS.csv")
     motion = thermal_shifts(shifts) if shifts.is_file() else None
-    if motion is not None and motion.views != len(degrees):
-        raise InputError.at(shifts, "rows", motion.views, f"{len(degrees)}, one a view")
+    if motion is not None:
+        if motion.views != views:
+            raise InputError.at(shifts, "rows", motion.views, f"{views}, one a view")
+        motion = motion.subset(index)
     scan = ScannerScan(
         format="SkyScan",
         path=path,
@@ -111,7 +113,10 @@ def read_skyscan(path: Path, options: ScannerOptions) -> ScannerScan:
         white=white if corrected or options.white else None,
         start_motion=motion,
         details={key.lower(): value for key in _DETAILS if (value := text.find(key))},
-        findings=_findings(text, line, direction, rotation, row, white if corrected else None),
+        findings=(
+            *lost,
+            *_findings(text, line, direction, rotation, row, white if corrected else None),
+        ),
     )
     return assembled(scan, options, rotation=rotation)
 
@@ -135,6 +140,13 @@ def _findings(
         found.append(
             assumed(f"square pixels: CameraXYRatio {ratio:g} is not applied", "--pixel-size")
         )
+    for key, usual, advice in (
+        ("Camera Offset", "OFF", "both halves are taken as one radiograph"),
+        ("Scanning Trajectory", "ROUND", "a helix needs --z-translation FILE"),
+    ):
+        told = (text.find(key) or usual).upper()
+        if told != usual:
+            found.append(Finding("unread", f"{key} {told} is not read", advice))
     moved = text.number("Postalignment", default=0.0)
     if moved:
         found.append(

@@ -30,15 +30,18 @@ from numpy.typing import NDArray
 from clra.errors import InputError
 from clra.findings import Finding
 from clra.io.frames.frame_views import ConvertedFrames, MissingFrames
+from clra.io.frames.numbered_files import (
+    frames_or_missing,
+    numbered_files,
+    present_views,
+    stack_or_none,
+)
 from clra.io.key_value_text import KeyValueText, read_table
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     Frames,
     ScannerScan,
     assembled,
-    frames_or_missing,
-    numbered_files,
-    stack_or_none,
     unverified,
 )
 from clra.io.scanners.stage import stage_geometry
@@ -74,11 +77,14 @@ def read_tescan(path: Path, options: ScannerOptions) -> ScannerScan:
     near, far = options.distances(
         text.number("SOD", positive=True), text.number("SDD", positive=True)
     )
-    files = [file for _, file in numbered_files(path.parent, _SCAN)]
+    numbered = numbered_files(path.parent, _SCAN)
+    files = [file for _, file in numbered]
     steps = text.whole("# projections")
     start, last = text.number("Start angle", default=0.0), text.number("Last angle", default=360.0)
-    views = len(files) or steps
-    degrees = options.degrees(start + (last - start) / steps * np.arange(views), path)
+    # There may be one more, at the end of the turn.
+    views = max(steps, len(files))
+    index, lost = present_views([number for number, _ in numbered], 0, views)
+    degrees = options.degrees(start + (last - start) / steps * index, path)
     edge = text.number("Binned pixel size", default=_pixel(text, far / near))
     width, height = options.pixel((edge, edge))
     frames = frames_or_missing(
@@ -86,6 +92,7 @@ def read_tescan(path: Path, options: ScannerOptions) -> ScannerScan:
     )
     shape = (int(frames.shape[1]), int(frames.shape[2]))
     findings = [
+        *lost,
         unverified("angles turn counter-clockwise seen from above", "--rotation cw"),
         unverified("row 0 the top, columns to the right seen from the source", "--flip"),
     ]

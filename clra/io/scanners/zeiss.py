@@ -23,6 +23,7 @@ from __future__ import annotations
 import struct
 import weakref
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.key_value_text import MOST
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     ScannerScan,
@@ -74,6 +76,7 @@ class TxrmFile:
         except OSError as error:
             raise InputError(f"{path}: cannot be read as .txrm: {error}") from error
         weakref.finalize(self, self._ole.close)
+        self._lock = Lock()  # devices read their views in threads of their own
         self.shape = (
             self.whole("ImageInfo/NoOfImages", "ImageInfo/ImagesTaken"),
             self.whole("ImageInfo/ImageHeight"),
@@ -129,16 +132,17 @@ class TxrmFile:
             If there is none, without a default.
         """
         values = self.numbers(*names, letter="i")
-        if values is not None and len(values) and values[0] > 0:
+        if values is not None and len(values) and 0 < values[0] <= MOST:
             return int(values[0])
         if default is None:
             found = "nothing" if values is None or not len(values) else f"{values[0]:g}"
-            raise InputError.at(self.path, names[0], found, "a whole number above 0")
+            raise InputError.at(self.path, names[0], found, f"a whole number of 1 to {MOST}")
         return default
 
     def _image(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
         rows, columns = self.shape[1:]
-        data = self._ole.openstream(name).read() if self._ole.exists(name) else b""
+        with self._lock:
+            data = self._ole.openstream(name).read() if self._ole.exists(name) else b""
         if len(data) != rows * columns * dtype.itemsize:
             expected = f"{rows * columns * dtype.itemsize}: {rows} x {columns} pixels of {dtype}"
             raise InputError.at(self.path, name, f"{len(data)} bytes", expected)

@@ -2,52 +2,63 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.io.units import TO_MM, factor
-from clra.model.grid import VolumeGrid
+from clra.io.volumes.slab_files import SlabWriter
+from clra.io.volumes.volume_description import PlaneSink, VolumeDescription
 
 # The offsets of a plain TIFF have 32 bits; room is left for its headers.
 _PLAIN_TIFF = (1 << 32) - (1 << 25)
+_PROVENANCE = "clra provenance: "
+_SCALING = "clra scale and offset of values: "
+_SCALED = re.compile(rf"{_SCALING}(\S+) (\S+)")
 _CENTRE = re.compile(r"clra centre x y z mm: (\S+) (\S+) (\S+)")
 
 
-def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLike]:
-    """Write everything of a TIFF but the voxels.
+@contextmanager
+def tiff_writer(path: Path, description: VolumeDescription) -> Iterator[PlaneSink]:
+    """Write a volume as a stack of pages.
 
-    ImageJ reads the voxel of its own plain TIFF; a BigTIFF cannot be one and carries OME's text.
+    ImageJ reads the voxel and the scale of its own plain TIFF; a BigTIFF cannot be one and carries
+    OME's text.
 
     Parameters
     ----------
     path : Path
         The file.
-    grid : VolumeGrid
-        Of the volume.
-    units : str
-        Of the voxels.
+    description : VolumeDescription
+        Goes into the text, the provenance as a line of JSON; the program into the tag Software.
 
-    Returns
-    -------
-    offset : int
-        Byte at which the voxels start.
-    dtype : dtype-like
-        As which they are written.
+    Yields
+    ------
+    PlaneSink
     """
+    grid, told = description.grid, description.attributes()
     size = grid.voxel_size
-    note = "clra centre x y z mm: {!r} {!r} {!r}\nunits: {}\n".format(*grid.centre, units)
-    plain = 4 * int(np.prod(grid.shape, dtype=np.int64)) < _PLAIN_TIFF
+    note = "clra centre x y z mm: {!r} {!r} {!r}\nunits: {}\n".format(*grid.centre, told["units"])
+    note += f"{_SCALING}{description.scale!r} {description.offset!r}\n"
+    note += f"{_PROVENANCE}{json.dumps(dict(description.provenance))}\n"
+    plain = description.bytes < _PLAIN_TIFF
     described: dict[str, Any]
     if plain:
         described = {"axes": "ZYX", "spacing": size, "unit": "mm", "Info": note}
+        if description.dtype != "float32":
+            # ImageJ's straight line from stored numbers to values.
+            line = {"cf": 0, "c0": description.offset, "c1": description.scale}
+            described |= {**line, "vunit": description.units}
     else:
         described = {"axes": "ZYX", "Description": note}
         for axis in "XYZ":
@@ -55,11 +66,12 @@ def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLik
     tifffile.imwrite(
         path,
         shape=grid.shape,
-        dtype=np.float32,
+        dtype=description.stored,
         bigtiff=not plain,
         imagej=plain,
         ome=not plain,
         photometric="minisblack",
+        software=f"clra {description.provenance.get('clra_version', '')}".strip(),
         # ImageJ counts in its own unit, others in centimetres.
         resolution=(1 / size, 1 / size) if plain else (10 / size, 10 / size),
         resolutionunit="NONE" if plain else "CENTIMETER",
@@ -70,12 +82,14 @@ def tiff_layout(path: Path, grid: VolumeGrid, units: str) -> tuple[int, DTypeLik
         offset = series.dataoffset
         # Set for every file whose pages lie in one run, as in those that imwrite makes.
         assert offset is not None
-        return offset, series.dtype.newbyteorder(tiff.byteorder)
+        stored = series.dtype.newbyteorder(tiff.byteorder)
+    with SlabWriter(path, offset, grid.shape, stored) as writer:
+        yield writer
 
 
 def tiff_volume(
     path: str | os.PathLike[str],
-) -> tuple[NDArray[Any], float, tuple[float, ...]]:
+) -> tuple[NDArray[Any], float, tuple[float, ...], tuple[float, float]]:
     """Open the volume in a TIFF.
 
     Parameters
@@ -91,6 +105,8 @@ def tiff_volume(
         In mm.
     centre : (float, float, float)
         Of the grid (x, y, z), 0 where the file does not tell [mm].
+    scaling : (float, float)
+        Scale and offset of the values.
 
     Raises
     ------
@@ -120,8 +136,14 @@ def tiff_volume(
     except Exception as error:  # tifffile fails in many ways on what is no TIFF
         raise InputError(f"{os.fspath(path)}: cannot be read as TIFF: {error}") from error
     told = _CENTRE.search(note)
-    centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
-    return voxels, sizes[-1], centre
+    line = _SCALED.search(note)
+    try:
+        centre = tuple(float(c) for c in told.groups()) if told else (0.0, 0.0, 0.0)
+        scaling = (float(line[1]), float(line[2])) if line else (1.0, 0.0)
+    except ValueError:
+        found = repr((told or line or [""])[0])
+        raise InputError.at(path, "centre", found, "three numbers") from None
+    return voxels, sizes[-1], centre, scaling
 
 
 def _voxel(tiff: tifffile.TiffFile) -> tuple[list[float], str]:

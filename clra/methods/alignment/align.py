@@ -1,28 +1,38 @@
 """Find out how each radiograph moved: the choice of method, options and what they go with."""
 
+import os
 from dataclasses import replace
 from typing import Any
 
-from clra.errors import InputError
-from clra.findings import collected
+from clra.errors import Cancelled, InputError
+from clra.findings import Finding, collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.quality import assess
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.diagnostics import evidence
+from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.preparation import prepared, with_detector_of
+from clra.methods.radiograph_checks import refuse_counts
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
 from clra.ops.runtime.versions import versions
+from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
 METHODS = ("ra", "imgr", "reference")
 ESTIMATES = ("shift", "shift+scale", "source")
 GAUGES = ("anchored", "free")
+# Valid views below which none can be held out.
+_ENOUGH_TO_JUDGE = 4
 
 
 def align(
@@ -39,8 +49,12 @@ def align(
     progress: ProgressCallback | None = None,
     gauge: str = "anchored",
     solver: Solver | None = None,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
+    resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    corrections: CorrectionOptions | None = None,
+    quality: bool = True,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -81,17 +95,31 @@ def align(
         scan: it would go on and stretch the sample. "anchored" takes it out in each iteration.
     solver : Solver, optional
         Parts of the iteration, to switch some off.
+    checkpoint : path-like, optional
+        Folder that keeps each finished iteration, so that an interruption of any kind loses none;
+        removed at success. A :class:`Checkpoint` is left to who made it.
+    resume : bool
+        Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
+    quality : bool
+        Whether to judge the result by views that are held out: a verdict, and standard errors that
+        count what is left. A motion that predicts them no better than the start is not returned.
 
     Returns
     -------
     AlignmentResult
+        Of the iterations that were finished, with a warning, if `progress` raised ``Cancelled``.
 
     Raises
     ------
     InputError
-        If an option is none of its choices or the scan has less than two views.
+        If an option is none of its choices, the scan has less than two views, or the checkpoint is
+        of another scan or of other options.
+    Cancelled
+        If `progress` raised it before anything was finished.
     AlignmentInterrupted
         On Ctrl-C after at least one iteration; carries the result so far.
 
@@ -101,6 +129,7 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    keeping, own = checkpoint_of(checkpoint, resume)
     # What the mask leaves of the detector is aligned as a detector of its own.
     part = scan.cropped()
     stages = parse_schedule(schedule, part.geometry.shape) if method == "ra" else ()
@@ -110,10 +139,6 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
-    if motion is not None:
-        motion = motion.about(*scan.window_offset)
-    truth = scan.truth if truth is None else truth
-    truth = None if truth is None else truth.about(*scan.window_offset)
     stream = Stream(
         device,
         max_device_memory=max_device_memory,
@@ -138,10 +163,17 @@ def align(
         )
 
     scale = estimate != "shift"
+    refuse_counts(scan)
     with collected() as findings:
+        scan = prepared(scan, corrections, progress=progress)
+        # What the mask leaves of the detector is aligned as a detector of its own.
+        part = scan.cropped()
+        motion = None if motion is None else motion.about(*scan.window_offset)
+        truth = scan.truth if truth is None else truth
+        truth = None if truth is None else truth.about(*scan.window_offset)
         if reference is not None:
             if reference.geometry.shape == scan.geometry.shape:
-                reference = replace(reference, mask=scan.mask).cropped()
+                reference = with_detector_of(scan, reference).cropped()
             drift = align_to_reference(stream, part, reference, scale=scale, truth=truth)
             if method == "reference":
                 return told(drift)
@@ -151,17 +183,64 @@ def align(
         grid = grid or default_grid(part.geometry)
         solver = solver or Solver()
         scale = scale and solver.estimator == "gauss-newton"
+        saved = None
+        if keeping is not None:
+            options = {"method": method, "schedule": schedule, "estimate": estimate}
+            options |= {"gauge": gauge, "solver": repr(solver)}
+            saved = keeping.begin(identity(part, grid, options, motion=start))
         try:
             if method == "imgr":
-                options = {"scale": scale, "anchor": anchor, "motion": start, "truth": truth}
-                return told(_by_imgr(stream, part, grid, levels=schedule, align=True, **options))
-            run = CoarseToFine(
-                stream, part, with_margin(grid), schedule, scale, anchor, solver, start, truth
-            )
-            run.align(stages)
+                aligned = _by_imgr(
+                    stream,
+                    part,
+                    grid,
+                    levels=schedule,
+                    align=True,
+                    scale=scale,
+                    anchor=anchor,
+                    motion=start,
+                    truth=truth,
+                    checkpoint=keeping,
+                    saved=saved,
+                )
+            else:
+                run = CoarseToFine(
+                    stream,
+                    part,
+                    with_margin(grid),
+                    schedule,
+                    scale,
+                    anchor,
+                    solver,
+                    start,
+                    truth,
+                    keeping,
+                )
+                run.align(stages, saved)
+                aligned = run.result()
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
-        return told(run.result())
+        if quality and not cancelled(findings):
+            aligned, told_of = _judged(stream, part, aligned, start, scale)
+            findings += told_of
+        result = told(aligned)
+    if own and keeping is not None and not cancelled(result.warnings):
+        keeping.clear()
+    return result
+
+
+def _judged(
+    stream: Stream, scan: Scan, aligned: AlignmentResult, start: Motion, scale: bool
+) -> tuple[AlignmentResult, list[Finding]]:
+    """Add a verdict and findings, unless the call is ended or there is not enough to judge by."""
+    try:
+        if aligned.valid_views.sum() >= _ENOUGH_TO_JUDGE:
+            aligned = assess(stream, scan, aligned, start, scale=scale)
+        return evidence(stream, scan, aligned)
+    except (Cancelled, DeviceMemoryError):
+        return aligned, []  # which is finished
+    except KeyboardInterrupt:
+        raise AlignmentInterrupted(aligned) from None
 
 
 def _by_imgr(stream: Stream, scan: Scan, grid: VolumeGrid, **options: Any) -> AlignmentResult:

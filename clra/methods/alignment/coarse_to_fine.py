@@ -7,6 +7,7 @@ simulated ones come out in the frame of the measured ones, so that what registra
 is left.
 """
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,13 +15,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import Cancelled
+from clra.findings import Finding
 from clra.methods.alignment.acceleration import MotionSteps
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered
-from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
+from clra.methods.execution.checkpoint import Checkpoint, Saved
+from clra.methods.execution.packing import (
+    history_from,
+    history_values,
+    motion_arrays,
+    motion_from,
+    registered_arrays,
+    registered_from,
+)
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
@@ -29,6 +41,8 @@ from clra.model.schedule import Stage, converged, level_name, update_size
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -55,6 +69,8 @@ class CoarseToFine:
         Where to start.
     truth : Motion, optional
         To report errors against.
+    checkpoint : Checkpoint, optional
+        Keeps each finished iteration.
     """
 
     stream: Stream
@@ -66,6 +82,7 @@ class CoarseToFine:
     solver: Solver
     start: Motion
     truth: Motion | None = None
+    checkpoint: Checkpoint | None = None
     several: bool = field(init=False)  # iterations in the schedule
     motion: Motion = field(init=False)
     history: list[Iteration] = field(init=False, default_factory=list)
@@ -84,19 +101,27 @@ class CoarseToFine:
         # magnifications of several per cent.
         self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
 
-    def align(self, stages: Sequence[Stage]) -> None:
-        """Go through the levels; what an interruption leaves is kept."""
+    def align(self, stages: Sequence[Stage], saved: Saved | None = None) -> None:
+        """Go through the levels, or what is left of them; what an interruption leaves is kept."""
         self.several = sum(stage.limit for stage in stages) > 1
+        first, done = (0, 0) if saved is None else self._go_on_from(saved)
         try:
-            for stage in stages:
-                self.align_level(stage)
+            for index, stage in enumerate(stages):
+                begun = done if index == first else 0
+                if index >= first and begun < stage.limit:
+                    self.align_level(stage, index, begun)
         except KeyboardInterrupt:
             if not self.history:
                 raise
             raise AlignmentInterrupted(self.result()) from None
+        except Cancelled:
+            if not self.history:
+                raise
+            message = f"the alignment was ended early, after {finished(self.history)}"
+            Finding("cancelled", message).warn()
 
-    def align_level(self, stage: Stage) -> None:
-        """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level)."""
+    def align_level(self, stage: Stage, index: int = 0, done: int = 0) -> None:
+        """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
         level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
@@ -107,7 +132,7 @@ class CoarseToFine:
         steps = self.solver.acceleration()
         self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
         previous = None
-        for iteration in range(1, (stage.iterations or stage.limit) + 1):
+        for iteration in range(done + 1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(level, title=of)
@@ -133,14 +158,16 @@ class CoarseToFine:
             )
             # 6, 13: until converged, whatever becomes of views that are rejected
             update_u, update_v = update[:, ~self.rejected]
-            if stage.iterations is None and converged(
+            ended = stage.iterations is None and converged(
                 update_u, update_v, previous, stage.tolerance
-            ):
+            )
+            self._keep(index, stage.limit if ended else iteration)
+            if ended:
                 break
             # A first step finds too little, see `_move`: the second may well find as much.
             previous = None if self.fresh else update_size(update_u, update_v)[0]
         if len({entry.level for entry in self.history}) == 1:
-            note = warned(lost_features(self.scan, found.correlation, stage.level))
+            note = warned(lost_features=lost_features(self.scan, found.correlation, stage.level))
             notes = filter(None, (self.history[-1].note, note))
             self.history[-1] = replace(self.history[-1], note="\n".join(notes))
 
@@ -170,16 +197,56 @@ class CoarseToFine:
         step = self.steps.step(self.motion, there)
         valid_views = np.abs(step[:, ~self.rejected])
         if self.history:
-            note = warned(false_shifts(*self.last, level, valid_views))
+            note = warned(false_shifts=false_shifts(*self.last, level, valid_views))
             self.fresh = bool(note)
         else:
-            note = warned(far_motion(found.motion, level))
+            note = warned(out_of_reach=far_motion(found.motion, level))
             self.fresh = True
         self.last = level, valid_views
         # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
         return step, note
+
+    def _keep(self, stage: int, done: int) -> None:
+        """Keep what the iterations so far gave: `done` of a stage."""
+        last = self.history[-1]
+        _LOG.info(
+            "%s %d: median update %.3g, %.3g pixel, correlation %.3f",
+            last.level,
+            last.iteration,
+            last.update_u_median,
+            last.update_v_median,
+            last.correlation,
+        )
+        if self.checkpoint is None:
+            return
+        level, update = self.last
+        arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
+        arrays |= {"rejected": self.rejected, "update": update}
+        values = {
+            "position": (stage, done),
+            "history": history_values(self.history),
+            "level": level,
+            "fresh": self.fresh,
+        }
+        self.checkpoint.save(
+            finished(self.history), values, arrays | registered_arrays(self.registered)
+        )
+
+    def _go_on_from(self, saved: Saved) -> tuple[int, int]:
+        """Take up a kept state; return the stage and how many of its iterations are done."""
+        arrays, values, cause = saved.arrays, saved.values, self.start.cause
+        self.motion = motion_from(arrays, "motion", cause)
+        self.found = motion_from(arrays, "found", cause)
+        self.rejected, self.fresh = arrays["rejected"], values["fresh"]
+        self.last = values["level"], arrays["update"]
+        self.history = history_from(values["history"])
+        registered = registered_from(arrays)
+        assert registered is not None  # by every iteration
+        self.registered = registered
+        stage, done = values["position"]
+        return stage, done
 
     @property
     def _shifts_first(self) -> bool:

@@ -6,15 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.reprojection import Registered, reproject_and_register
-from clra.methods.reconstruction.fbp import ramp_fbp
-from clra.model.geometry import ConeBeamGeometry
+from clra.methods.alignment.reprojection import Registered, binned_mask, reproject_and_register
+from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming.memory import Store
 from clra.ops.streaming.radiographs import Radiographs
-from clra.ops.streaming.slab_projector import SlabProjector
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
@@ -91,15 +88,18 @@ class Level:
         # Motions are in full-resolution pixels: absorb first, then bin.
         geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
 
-        def reconstructed(radiographs: Radiographs, doing: str) -> Volume:
-            return ramp_fbp(
+        def reconstructed(radiographs: Radiographs, doing: str | None = None) -> Volume:
+            return fitted_fbp(
                 self.stream,
                 radiographs,
                 geometry,
                 self.grid,
+                positive=self.solver.positive,
+                terms=self.solver.terms,
                 valid_views=valid_views,
                 circle=self.solver.circle,
-                stage=f"{title}: {doing}",
+                used=self.used,
+                stage=title if doing is None else f"{title}: {doing}",
             )
 
         def registered(radiographs: Radiographs, volume: Volume, doing: str) -> Registered:
@@ -108,6 +108,7 @@ class Level:
                 radiographs,
                 volume,
                 geometry,
+                # Made anew: it would stand beside the reconstruction's memory.
                 self.solver.registration(
                     self.stream,
                     self.scan,
@@ -120,75 +121,24 @@ class Level:
                 stage=f"{title}: {doing}",
             )
 
-        def projected(volume: Volume, lacking_of: Radiographs | None = None) -> Radiographs:
-            return reprojections(
-                self.stream,
-                volume,
-                geometry,
-                self.factor,
-                f"{title}: simulating",
-                lacking_of=lacking_of,
-            )
-
         # 2: reconstruct from the corrected radiographs
-        volume = reconstructed(self.radiographs, "reconstructing")
+        volume = reconstructed(self.radiographs)
         # 3, 4: simulate and register
         found = registered(self.radiographs, volume, "registering")
-        if measure and self.bias is None and self.solver.is_biased(geometry.shape):
-            if self.solver.is_blurred(geometry.shape):
-                volume = reconstructed(projected(volume, self.radiographs), "sharpening")
-            still = projected(volume)
+        if measure and self.bias is None and self.solver.is_biased(geometry):
+            still = reprojections(
+                self.stream, volume, geometry, self.factor, f"{title}: simulating"
+            )
             del volume
-            volume = reconstructed(still, "reconstructing what is simulated")
+            volume = reconstructed(still, "what is simulated")
             self.bias = registered(still, volume, "registering what is simulated").motion
         if self.bias is None:
             return found
         return replace(found, motion=self.bias.inverse().then(found.motion))
 
-
-def reprojections(
-    stream: Stream,
-    volume: Volume,
-    geometry: ConeBeamGeometry,
-    level: int,
-    stage: str,
-    *,
-    lacking_of: Radiographs | None = None,
-) -> Radiographs:
-    """Return the re-projections ``A x`` of a volume x, kept like binned radiographs.
-
-    Off circles, and far from their plane, ramp-filtered back-projection B is no inverse of the
-    projection A, and re-projections ``A B p`` of radiographs p are displaced by its artefacts: by
-    0.3 pixel in v for a helix whose views look 34 degrees up and down. How far depends on what the
-    sample looks like, and x looks like it. Its re-projections fit each other and their geometry
-    exactly: whatever a registration finds of them against their own ``A B A x`` is displacement.
-
-    The more x is blurred, the less it looks like the sample. A volume from ``p + (p - A x)`` is
-    sharper: ``x + B (p - A x)``, two terms of the Neumann series for the inverse.
-
-    Parameters
-    ----------
-    stream : Stream
-        Device and memory budget.
-    volume : Volume
-        Attenuation [1/mm].
-    geometry : ConeBeamGeometry
-        Of the radiographs, with the motion absorbed.
-    level : int
-        Binning factor that they shall count as.
-    stage : str
-        What progress reports call this.
-    lacking_of : Radiographs, optional
-        Return these and what they have beyond the re-projections instead.
-    """
-    project = SlabProjector(stream, volume, geometry)
-    kept = Store((geometry.views, *geometry.shape), stream.room)
-    radiographs = Radiographs.of(kept, level)
-    for views in stream.chunks(geometry.views, radiographs.view_bytes):
-        stream.report(stage, views.start, geometry.views)
-        projected = stream.empty((views.stop - views.start, *geometry.shape))
-        project(projected, views)
-        part = stream.download(projected)
-        kept.write(views.start, part if lacking_of is None else 2 * lacking_of.read(views) - part)
-    stream.report(stage, geometry.views, geometry.views)
-    return radiographs
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Pixels of the binned detector that count."""
+        mask = self.scan.mask
+        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
+        return binned_mask(full, self.factor)

@@ -3,12 +3,11 @@
 The paper names both in its Section 4.
 """
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from clra.findings import warn
 from clra.methods.alignment.reprojection import REACH
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -122,12 +121,12 @@ def lost_features(scan: Scan, correlation: Floats, level: int) -> str:
     )
 
 
-def warned(*notes: str) -> str:
-    """Warn of each note that is not empty; return them as one, a line each."""
-    said = [note for note in notes if note]
-    for note in said:
-        warnings.warn(note, stacklevel=2)
-    return "\n".join(said)
+def warned(**notes: str) -> str:
+    """Warn of each note that is not empty, by its code; return them as one, a line each."""
+    said = {code: note for code, note in notes.items() if note}
+    for code, note in said.items():
+        warn(code.replace("_", "-"), note)
+    return "\n".join(said.values())
 
 
 def surviving_contrast(scan: Scan, level: int) -> float:

@@ -12,7 +12,6 @@ References
 """
 
 import time
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
 from clra.errors import InputError
+from clra.findings import warn
 from clra.methods.alignment.rejected_views import outliers
 from clra.methods.alignment.reprojection import (
     Registered,
@@ -164,10 +164,10 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
             f"{_FEWEST} or more"
         )
     if len(pairs) < reference.views:
-        warnings.warn(
+        warn(
+            "reference-views",
             f"{reference.name}: {reference.views - len(pairs)} of {reference.views} views look "
             f"like none of {scan.name}, or like the same one as another, and are left out",
-            stacklevel=2,
         )
     views = match.views[pairs]
     found = _registered(stream, scan.subset(views), reference.subset(pairs), scale)
@@ -185,10 +185,10 @@ def drift_from_reference(stream: Stream, scan: Scan, reference: Scan, *, scale: 
         )
     ends = views[good][0], views[good][-1]
     if max(ends[0], scan.views - 1 - ends[1]) > _BEYOND * scan.views:
-        warnings.warn(
+        warn(
+            "reference-gap",
             f"{reference.name}: found views beside {ends[0]} to {ends[1]} of {scan.name}'s 0 to "
             f"{scan.views - 1}: beyond these the drift is not known, and taken to stay as it was",
-            stacklevel=2,
         )
     smooth = _smooth(scan.views, views[good], drift.subset(good))
     return Drift(smooth, views, replace(found, motion=drift))

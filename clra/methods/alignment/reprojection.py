@@ -115,6 +115,7 @@ def registration_for(
             "rows and columns there to register; start at a finer level, such as with schedule 4FR"
         )
     low_pass, high_pass = band_of((rows, columns), first=first)
+    mask = scan.registration_mask
     chunks = stream.chunks(views, radiographs.view_bytes)
     return Registration(
         stream.context,
@@ -122,7 +123,7 @@ def registration_for(
         views=max(chunk.stop - chunk.start for chunk in chunks),
         low_pass=low_pass,
         high_pass=high_pass,
-        mask=None if scan.mask is None else binned_mask(scan.mask, radiographs.level),
+        mask=None if mask is None else binned_mask(mask, radiographs.level),
         magnification=magnification and not still,
         spread=spread * _size((rows, columns)) ** 2,
         coarse=not still,
@@ -179,7 +180,7 @@ def reprojected(
     views, rows, columns = radiographs.shape
     for chunk in stream.chunks(views, radiographs.view_bytes):
         stream.report(stage, chunk.start, views)
-        measured = stream.upload(radiographs.read(chunk))
+        measured = radiographs.on_device(stream, chunk)
         simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
         project(simulated, chunk)
         yield chunk, measured, simulated

@@ -1,5 +1,6 @@
 """What an alignment returns."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
@@ -90,6 +91,12 @@ class SupportsAsDict(Protocol):
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
         ...
+
+
+def finished(history: Sequence[Iteration]) -> str:
+    """Say what is finished: "2 iterations, the last at HR"."""
+    count = len(history)
+    return f"{count} iteration{'s' * (count > 1)}, the last at {history[-1].level}"
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -214,6 +221,15 @@ class AlignmentResult:
     def flagged(self) -> tuple[int, ...]:
         """Rejected views, from 0."""
         return tuple(np.flatnonzero(~self.valid_views).tolist())
+
+    def checksum_of_motion(self) -> str:
+        """Return a checksum of the motion and the valid views: what a reconstruction takes."""
+        motion = self.motion
+        digest = hashlib.sha256(motion.cause.encode())
+        for column in (motion.shift_u, motion.shift_v, motion.magnification):
+            digest.update(np.ascontiguousarray(column, "<f8").tobytes())
+        digest.update(self.valid_views.tobytes())
+        return f"sha256:{digest.hexdigest()}"
 
     @property
     def scale_estimated(self) -> bool:

@@ -8,13 +8,16 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clra.methods.alignment.rejected_views import neighbour_weights
-from clra.model.angular_coverage import angle_weights
+from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.model.sampling.angular_coverage import angle_weights
+from clra.model.sampling.ray_weights import ray_weights
 from clra.model.view_selection import runs, views_that_see
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage, around
 from clra.ops.projection.projector import BackProjector
+from clra.ops.streaming.multigrid import add_to_slab
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import PlaneWriter, Volume
@@ -30,17 +33,22 @@ def ramp_fbp(
     stage: str = "back-projecting",
     volumes: int = 1,
     circle: bool = True,
+    positive: bool = False,
+    window: str = "ram-lak",
+    extend: float | None = None,
     planes: slice | None = None,
     target: PlaneWriter | None = None,
+    onto: Volume | None = None,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
 
     ``f(x) = pi / W(x) sum_i w_i(x) (SOD / U_i(x))^2 q_i(x)``: q_i is the cosine-weighted,
     ramp-filtered radiograph, U_i the depth of x below the source, w_i the weight of the row that x
-    falls on, and W = sum_i w_i the number of views that see x. For full circles this is FDK [1]_,
-    views that do not stand evenly having the weight of the angle that each stands for; elsewhere
-    intensities are a few per cent off, for a part of a circle up to a fifth, edges are where they
-    belong.
+    falls on, and W = sum_i w_i the number of views that see x. For circles this is FDK [1]_: views
+    that do not stand evenly have the weight of the angle that each stands for, and redundant rays
+    of short scans and offset detectors those of
+    :class:`clra.model.sampling.ray_weights.RayWeights`. Elsewhere
+    intensities are a few per cent off, and edges are where they belong.
 
     Parameters
     ----------
@@ -61,10 +69,20 @@ def ramp_fbp(
         How many volumes like this one the device has to hold at a time.
     circle : bool
         Leave zero what lies outside the circle that all views see.
+    positive : bool
+        Raise negative attenuations to zero.
+    window : {"ram-lak", "shepp-logan", "hann"}
+        Of the ramp filter.
+    extend : float, optional
+        Part of the columns by which rows are continued past the detector; by default as far as the
+        sample seems to reach, see :func:`clra.methods.truncation.extension`.
     planes : slice, optional
         Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
+    onto : Volume, optional
+        On this grid, in the same slabs: changed to ``max(0, onto + what is reconstructed)`` and
+        returned. `positive`, `planes` and `target` do not go with it.
 
     Returns
     -------
@@ -81,7 +99,19 @@ def ramp_fbp(
     memory: dict[str, Any] = {"allocator": stream.memory, "scratch_limit": stream.scratch_limit}
     chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
     weight = neighbour_weights(geometry.source, chosen) * angle_weights(geometry)
-    ramp = RampFilter(context, geometry, row_weight=row_weight, view_weight=weight, **memory)
+    rays = ray_weights(geometry)
+    scale = math.pi if rays is None else rays.covered / float(weight.sum())
+    ramp = RampFilter(
+        context,
+        geometry,
+        row_weight=row_weight,
+        view_weight=weight,
+        ray_weights=rays,
+        window=window,
+        extend=extension(radiographs, geometry, chosen) if extend is None else extend,
+        **memory,
+    )
+    filtered_bytes = 4 * math.prod(ramp.geometry.shape)
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])
     coverage = Coverage(
@@ -90,11 +120,12 @@ def ramp_fbp(
         grid.slab(near.start, near.stop),
         row_weight,
         view_weight=weight[chosen],
+        ray_weights=None if rays is None else rays.subset(chosen),
         circle=circle,
         allocator=stream.memory,
     )
     coverage.compute(queue)
-    volume = Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
+    volume = onto or Volume(stream, grid.slab(wanted.start, wanted.stop), volumes=volumes)
     slabs = volume.slabs
     seeing = [chosen & views_that_see(geometry, slab) for slab in slabs]
     total, done = sum(int(views.sum()) for views in seeing), 0
@@ -102,14 +133,14 @@ def ramp_fbp(
         nz, ny, nx = slab.shape
         attenuation = stream.empty((ny, nx, nz))
         attenuation.fill(np.float32(0), queue=queue)
-        back = BackProjector(context, geometry, slab, volume_order="yxz", **memory)
+        back = BackProjector(context, ramp.geometry, slab, volume_order="yxz", **memory)
         busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
         for run in runs(seeing[index]):
-            for chunk in stream.chunks(run.stop - run.start, radiographs.view_bytes):
+            for chunk in stream.chunks(run.stop - run.start, filtered_bytes):
                 views = slice(run.start + chunk.start, run.start + chunk.stop)
                 stream.report(stage, done, total)
-                measured = stream.upload(radiographs.read(views))
-                filtered = stream.empty(measured.shape)
+                measured = radiographs.on_device(stream, views)
+                filtered = stream.empty((len(measured), *ramp.geometry.shape))
                 ready = ramp(queue, filtered, measured, views=views)
                 event = back(
                     queue, attenuation, filtered, views=views, accumulate=True, wait_for=[ready]
@@ -122,8 +153,13 @@ def ramp_fbp(
                 del measured, filtered
                 done += views.stop - views.start
         first = wanted.start - near.start + volume.planes[index].start
-        coverage.normalise(queue, attenuation, math.pi, first=first, volume_order="yxz")
-        if target is None:
+        lowest = 0.0 if positive else -math.inf
+        coverage.normalise(
+            queue, attenuation, scale, first=first, lowest=lowest, volume_order="yxz"
+        )
+        if onto is not None:
+            add_to_slab(stream, onto, index, attenuation)
+        elif target is None:
             volume.put(index, attenuation)
         else:
             volume.write_slab(index, attenuation, target)

@@ -14,11 +14,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.errors import InputError
+from clra.errors import Cancelled, InputError
+from clra.findings import Finding
 from clra.methods.alignment.limits import far_motion, lost_features, warned
 from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered, with_margin
 from clra.methods.alignment.result import AlignmentResult, Iteration
+from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.reconstruction.imgr_level import MultigridLevel
 from clra.methods.reconstruction.imgr_state import (
     ImgrState,
@@ -32,9 +34,9 @@ from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.model.schedule import converged, level_name, parse_levels
+from clra.model.schedule import converged, level_factor, level_name, parse_levels
 from clra.model.view_selection import sampled
-from clra.ops.streaming.multigrid import add_update, cropped
+from clra.ops.streaming.multigrid import add_update, cropped, prolongate
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
@@ -59,6 +61,8 @@ def imgr(
     truth: Motion | None = None,
     osem: OrderedSubsets | None = None,
     state: ImgrState | None = None,
+    checkpoint: Checkpoint | None = None,
+    saved: Saved | None = None,
 ) -> MultigridResult:
     """Reconstruct from coarse to fine, and align on the way.
 
@@ -89,10 +93,16 @@ def imgr(
         How the lowest level is reconstructed.
     state : ImgrState, optional
         Where an interrupted run stopped: it goes on to the last bit as if it had not.
+    checkpoint : Checkpoint, optional
+        Keeps what each finished level gives.
+    saved : Saved, optional
+        In place of `state`: what the checkpoint kept of it.
 
     Returns
     -------
     MultigridResult
+        Of the levels that were finished, brought to full resolution, if a progress callback raised
+        ``Cancelled``.
 
     Raises
     ------
@@ -114,14 +124,21 @@ def imgr(
         raise InputError(f"{scan.name}: found {scan.views} view, expected at least 2 to align")
     cycles = cycles or (_CYCLES if align else _CYCLES_UNALIGNED)
     start = motion or Motion.identity(scan.views)
-    run = _Run(stream, scan, with_margin(grid), factors, align, scale, anchor, osem, truth, start)
+    wide = with_margin(grid)
+    run = _Run(stream, scan, wide, factors, align, scale, anchor, osem, truth, start, checkpoint)
+    if saved is not None:
+        state = ImgrState.kept(saved, stream, wide)
     rejected = np.zeros(scan.views, np.bool_) if valid_views is None else ~valid_views
     run.done = state or ImgrState(None, start, rejected)
     try:
-        run.cycles(cycles)
-        first = (run.grid.shape[0] - grid.shape[0]) // 2
-        assert run.done.volume is not None
-        volume = cropped(stream, run.done.volume, first, grid)
+        try:
+            run.cycles(cycles)
+        except Cancelled:
+            if not run.done.steps:
+                raise
+            message = f"the reconstruction was ended early: it is that of {run.done.finished}"
+            Finding("cancelled", message).warn()
+        volume = cropped(stream, run.full(), (wide.shape[0] - grid.shape[0]) // 2, grid)
     except KeyboardInterrupt:
         if not run.done.steps:
             raise
@@ -143,9 +160,8 @@ class _Run:
     osem: OrderedSubsets
     truth: Motion | None
     start: Motion
+    checkpoint: Checkpoint | None
     done: ImgrState = field(init=False)
-    registered: Registered | None = field(init=False, default=None)
-    found: Motion = field(init=False)  # by the last registration, with its gauge
 
     def __post_init__(self) -> None:
         points = sample_points(self.grid)
@@ -163,6 +179,18 @@ class _Run:
             last = position + 1 == len(self.factors)
             ended = last and (cycle + 1 == most or self._converged(done))
             self.done = replace(done, ended=ended)
+            if self.checkpoint is not None:
+                self.done.keep(self.checkpoint)
+
+    def full(self) -> Volume:
+        """Return the volume at full resolution, whatever level was finished last."""
+        volume = self.done.volume
+        assert volume is not None
+        for factor in (4, 2, 1):
+            if factor < level_factor(self.done.steps[-1].level):
+                grid = self.grid.binned(factor) if factor > 1 else self.grid
+                volume = prolongate(self.stream, volume, grid, volumes=1)
+        return volume
 
     def _correct(self, level: MultigridLevel, cycle: int, title: str) -> ImgrState:
         """One resolution of a cycle: steps 4 to 9, 10 to 15, or 16 to 21."""
@@ -180,7 +208,8 @@ class _Run:
             title=title,
         )
         # 7, 14, 20: transform, by absorbing the motion in the geometry
-        motion, rejected = (before, self.done.rejected) if found is None else self._moved(found)
+        done = self.done if found is None else self._moved(found)
+        motion, rejected = done.motion, done.rejected
         shape = self.scan.geometry.shape
         moved = between(before, motion, shape, level.factor) if self.align else None
         # 15, 21: calculate the update, back-project and filter
@@ -195,13 +224,8 @@ class _Run:
             level.reconstruct(volume, motion, ~rejected, title)
         step = ImgrStep(cycle, level_name(level.factor), misfit, time.perf_counter() - started)
         self.stream.report(f"{title}: misfit {misfit:.4g} before", 1, 1)
-        return ImgrState(
-            volume,
-            motion,
-            rejected,
-            (*self.done.steps, step),
-            self.done.history if found is None else self._history(step, motion, found, level),
-        )
+        history = done.history if found is None else self._history(step, motion, found, level)
+        return replace(done, volume=volume, steps=(*done.steps, step), history=history)
 
     def _so_far(self, level: MultigridLevel) -> Volume:
         """Bring what there is to a level's resolution."""
@@ -212,13 +236,18 @@ class _Run:
             self.done = replace(self.done, rejected=odd)
         return level.first(self.done.motion, ~self.done.rejected)
 
-    def _moved(self, found: Registered) -> tuple[Motion, NDArray[np.bool_]]:
-        """Append what was found to the motion; also which views are rejected."""
-        self.registered, rejected = found, outliers(found.correlation)
-        self.found = from_neighbours(self.done.motion.then(found.motion), rejected)
-        gauge, start = self.shift_gauge, self.start
-        motion = gauge.anchored(self.found, start) if self.anchor else self.found
-        return motion.normalised(), rejected
+    def _moved(self, found: Registered) -> ImgrState:
+        """Append what was found to the motion, and tell which views are rejected."""
+        rejected = outliers(found.correlation)
+        there = from_neighbours(self.done.motion.then(found.motion), rejected)
+        motion = self.shift_gauge.anchored(there, self.start) if self.anchor else there
+        return replace(
+            self.done,
+            motion=motion.normalised(),
+            rejected=rejected,
+            registered=found,
+            found=there,
+        )
 
     def _history(
         self, step: ImgrStep, motion: Motion, found: Registered, level: MultigridLevel
@@ -239,7 +268,7 @@ class _Run:
             found.residual,
             step.seconds,
             misfit=step.misfit,
-            note=warned(far, lost),
+            note=warned(out_of_reach=far, lost_features=lost),
             **errors,
         )
         return (*self.done.history, iteration)
@@ -258,14 +287,14 @@ class _Run:
 
     def alignment(self) -> AlignmentResult | None:
         """Return what was found of the motion, if anything was registered."""
-        if self.registered is None:
+        if self.done.registered is None or self.done.found is None:
             return None
         return AlignmentResult.of(
             self.done.motion,
             self.done.history,
-            self.registered,
+            self.done.registered,
             self.done.rejected,
-            self.gauge.fit(self.found),
+            self.gauge.fit(self.done.found),
             "-".join(map(level_name, self.factors)),
             self.stream.device.name,
         )

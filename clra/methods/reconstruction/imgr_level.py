@@ -80,7 +80,7 @@ class MultigridLevel:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Pixels of the binned detector that count."""
-        mask = self.scan.mask
+        mask = self.scan.registration_mask
         return binned_mask(
             np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask, self.factor
         )

@@ -1,12 +1,26 @@
 """What a multigrid reconstruction tells of its steps, goes on from, and returns."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentResult, Iteration
+from clra.methods.execution.checkpoint import Checkpoint, Saved
+from clra.methods.execution.packing import (
+    history_from,
+    history_values,
+    motion_arrays,
+    motion_from,
+    registered_arrays,
+    registered_from,
+)
+from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
+from clra.model.schedule import level_factor
+from clra.ops.streaming.slab_projector import volume_from
+from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
 
@@ -50,6 +64,10 @@ class ImgrState:
         Their alignment.
     ended : bool
         Whether it has converged, or had all its cycles.
+    registered : Registered or None
+        What the last registration found, if there was one.
+    found : Motion or None
+        By that registration, with its gauge.
     """
 
     volume: Volume | None
@@ -58,6 +76,47 @@ class ImgrState:
     steps: tuple[ImgrStep, ...] = ()
     history: tuple[Iteration, ...] = ()
     ended: bool = False
+    registered: Registered | None = None
+    found: Motion | None = None
+
+    @property
+    def finished(self) -> str:
+        """Say what is finished."""
+        last = self.steps[-1]
+        return f"cycle {last.cycle} up to {last.level}"
+
+    def keep(self, checkpoint: Checkpoint) -> None:
+        """Keep it on disk."""
+        arrays = motion_arrays("motion", self.motion) | registered_arrays(self.registered)
+        arrays["rejected"] = self.rejected
+        if self.found is not None:
+            arrays |= motion_arrays("found", self.found)
+        values = {
+            "cause": self.motion.cause,
+            "steps": [asdict(step) for step in self.steps],
+            "history": history_values(self.history),
+            "ended": self.ended,
+        }
+        checkpoint.save(self.finished, values, arrays, self.volume)
+
+    @classmethod
+    def kept(cls, saved: Saved, stream: Stream, grid: VolumeGrid) -> "ImgrState":
+        """Return a state that was kept; `grid` is that with its margin, at full resolution."""
+        arrays, values = saved.arrays, saved.values
+        steps = tuple(ImgrStep(**step) for step in values["steps"])
+        factor = level_factor(steps[-1].level)
+        grid = grid.binned(factor) if factor > 1 else grid
+        cause = values["cause"]
+        return cls(
+            volume=volume_from(stream, grid, saved.planes),
+            motion=motion_from(arrays, "motion", cause),
+            rejected=arrays["rejected"],
+            steps=steps,
+            history=tuple(history_from(values["history"])),
+            ended=values["ended"],
+            registered=registered_from(arrays),
+            found=motion_from(arrays, "found", cause) if "found" in arrays else None,
+        )
 
 
 class ReconstructionInterrupted(KeyboardInterrupt):

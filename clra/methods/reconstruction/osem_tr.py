@@ -1,5 +1,6 @@
 """Ordered-subset reconstruction from transmission data with Poisson noise (OSEM-TR)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,6 +115,8 @@ def osem_tr(
     used: NDArray[np.bool_],
     valid_views: NDArray[np.bool_] | None = None,
     stage: str = "OSEM-TR",
+    done: int = 0,
+    after_pass: Callable[[int], None] | None = None,
 ) -> list[float]:
     """Raise the likelihood of a volume, one subset of the views after the other.
 
@@ -135,6 +138,10 @@ def osem_tr(
         Views to reconstruct from, at least one; all by default.
     stage : str
         What progress reports call this.
+    done : int
+        Passes that `volume` has had already.
+    after_pass : callable, optional
+        Called with the number of each pass that is finished.
 
     Returns
     -------
@@ -150,17 +157,17 @@ def osem_tr(
         denominator = rays.curvature(f"{stage}: weighing rays")
         least = _LEAST * _largest(stream, denominator)
     misfits = []
-    for number in range(1, options.passes + 1):
-        done = 0
+    for number in range(done + 1, options.passes + 1):
+        seen = 0
         for subset in rays.subsets:
             numerator = _zeros(stream, volume)
             if not precomputed:
                 denominator = _zeros(stream, volume)
             for views in subset:
                 # l = A mu, and A' of what the likelihood says of it
-                stream.report(f"{stage}: pass {number}/{options.passes}", done, rays.views)
+                stream.report(f"{stage}: pass {number}/{options.passes}", seen, rays.views)
                 rays.add(numerator, None if precomputed else denominator, views)
-                done += views.stop - views.start
+                seen += views.stop - views.start
             if not precomputed:
                 least = _LEAST * _largest(stream, denominator)
             # mu <- max(0, mu + subsets numerator / d), or mu <- mu numerator / denominator
@@ -175,7 +182,9 @@ def osem_tr(
                 volume.put(index, mu)
                 stream.queue.finish()
         misfits.append(rays.statistics.misfit(stream.queue, rays.views))
-        stream.report(f"{stage}: pass {number}/{options.passes}", done, rays.views)
+        stream.report(f"{stage}: pass {number}/{options.passes}", seen, rays.views)
+        if after_pass is not None:
+            after_pass(number)
     return misfits
 
 

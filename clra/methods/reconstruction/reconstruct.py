@@ -1,28 +1,37 @@
 """From a scan to a volume: picks the method and the defaults."""
 
-import warnings
+import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.findings import Finding, collected
 from clra.methods.alignment.align import align as align_scan
 from clra.methods.alignment.result import AlignmentResult
 from clra.methods.correction import corrected
-from clra.methods.execution.several_devices import on_devices
+from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of
+from clra.methods.execution.several_devices import Work, on_devices
+from clra.methods.preparation import prepared
 from clra.methods.reconstruction import iterative
 from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.reconstruction.imgr_state import ImgrStep
+from clra.methods.reconstruction.iterative import Options
 from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevich
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.truncation import truncated
-from clra.model.angular_coverage import part_of_a_turn
+from clra.model.binning import binned_motion, binned_scan
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.detector_pose import steep_rows
-from clra.model.grid import VolumeGrid, default_grid
+from clra.model.grid import Region, VolumeGrid, volume_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
+from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
-from clra.model.validation import believed_views
+from clra.model.validation import checked_valid_views
+from clra.ops.filtering.ramp import WINDOWS
 from clra.ops.runtime.devices import usable_devices
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -42,10 +51,17 @@ def reconstruct(
     *,
     alignment: AlignmentResult | None = None,
     valid_views: NDArray[np.bool_] | None = None,
+    options: Options | None = None,
     progress: ProgressCallback | None = None,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
+    resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
-    **options: Any,
+    corrections: CorrectionOptions | None = None,
+    binning: int = 1,
+    roi: Region | None = None,
+    voxel_size: float | None = None,
+    window: str = "ram-lak",
 ) -> NDArray[np.float32]:
     """Reconstruct a volume.
 
@@ -55,9 +71,8 @@ def reconstruct(
         Radiographs and their geometry.
     method : {"fbp", "katsevich", "osem-tr", "imgr"}
         Ramp-filtered back-projection, for any trajectory; Katsevich's, which is exact, for helices
-        and double helices; ordered subsets for counted photons
-        (`osem_tr`); or the paper's Algorithm 3, which solves the lowest
-        resolution by these and corrects the higher ones once (`imgr`).
+        and double helices; ordered subsets for counted photons (`osem_tr`); or the paper's
+        Algorithm 3, which solves the lowest resolution by these and corrects the higher ones once.
     grid : VolumeGrid, optional
         Where to reconstruct; by default the whole field of view
         (:func:`clra.model.grid.default_grid`).
@@ -68,23 +83,36 @@ def reconstruct(
         Estimate the motion first, with the defaults of :func:`clra.align`; "imgr" does so on the
         way.
     device : str or cl.Device, optional
-        As `choose_device` takes it, or "all" to share the work out to all
-        devices of the best kind; alignment and iterative methods take the first of them.
+        As `choose_device` takes it, or "all" to share the work out to all devices of the best kind;
+        alignment and iterative methods take the first of them.
     alignment : AlignmentResult, optional
         In place of `motion`: views that it rejects are left out.
     valid_views : ndarray of bool, (views,), optional
         Views to reconstruct from; by default all, or those that the alignment did not reject.
         "katsevich" needs every view: what lies between the radiographs beside stands in for the
         others, and for views that the scan lacks.
+    options : OrderedSubsets or Multigrid, optional
+        Of "osem-tr" and of "imgr".
     progress : callable, optional
-        Called with a :class:`clra.progress.Progress` as work goes on.
+        Called with a :class:`clra.progress.Progress` as work goes on. If it raises ``Cancelled``,
+        the iterative methods return what their finished passes or levels gave, with a warning.
+    checkpoint : path-like, optional
+        Folder that keeps each finished pass of "osem-tr", level of "imgr" and iteration of an
+        alignment, so that an interruption of any kind loses none; removed at success. A
+        :class:`Checkpoint` is left to who made it.
+    resume : bool
+        Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional
-        Bytes that may be used, see `Stream`. The volume that is returned
-        comes on top: :func:`reconstruct_into` takes one larger than the memory.
-    **options
-        Of "osem-tr" and "imgr": the fields of `OrderedSubsets`
-        (subsets, passes, update, initial, i0, background); of "imgr" also levels and cycles, as
-        :func:`clra.methods.reconstruction.imgr.imgr` takes them.
+        Bytes that may be used, see `Stream`. The volume that is returned comes on top:
+        :func:`reconstruct_into` takes one larger than the memory.
+    corrections : CorrectionOptions, optional
+        Defects of the radiographs to look for and correct first; by default the defaults of these.
+    binning : int
+        Average radiographs over this many rows and columns first, but align the whole ones.
+    roi, voxel_size
+        Of the grid if none is given, see :func:`clra.model.grid.volume_grid`.
+    window : {"ram-lak", "shepp-logan", "hann"}
+        Of the ramp filter of "fbp": the latter two trade resolution for less noise.
 
     Returns
     -------
@@ -94,11 +122,14 @@ def reconstruct(
     Raises
     ------
     InputError
-        If the method or an option of it is unknown, no view is valid_views, both `motion` and
-        `align` are given, or the scan is one that Katsevich's method cannot treat; says what pitch,
-        detector or field of view would do.
+        If the method is unknown, the options are another's, no view is valid, two of `motion`,
+        `alignment` and `align` are given, the checkpoint is of another call, or the scan is one
+        that Katsevich's method cannot treat; says what pitch, detector or field of view would do.
+    Cancelled
+        If `progress` raised it before anything was finished.
     """
-    planes = HostPlanes(grid or default_grid(scan.cropped().geometry))
+    seen = scan.cropped().geometry.binned(binning)
+    planes = HostPlanes(grid or volume_grid(seen, roi=roi, voxel_size=voxel_size))
     reconstruct_into(
         planes,
         scan,
@@ -109,12 +140,36 @@ def reconstruct(
         device,
         alignment=alignment,
         valid_views=valid_views,
+        options=options,
         progress=progress,
+        checkpoint=checkpoint,
+        resume=resume,
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
-        **options,
+        corrections=corrections,
+        binning=binning,
+        window=window,
     )
     return planes.volume
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What is known of a volume beside its voxels.
+
+    Attributes
+    ----------
+    warnings : tuple of Finding
+        What was found on the way.
+    steps : tuple of ImgrStep
+        Of "imgr".
+    alignment : AlignmentResult or None
+        That it was reconstructed with.
+    """
+
+    warnings: tuple[Finding, ...]
+    steps: tuple[ImgrStep, ...] = ()
+    alignment: AlignmentResult | None = None
 
 
 def reconstruct_into(
@@ -128,21 +183,32 @@ def reconstruct_into(
     *,
     alignment: AlignmentResult | None = None,
     valid_views: NDArray[np.bool_] | None = None,
+    options: Options | None = None,
     progress: ProgressCallback | None = None,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
+    resume: bool = False,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
-    **options: Any,
-) -> None:
+    corrections: CorrectionOptions | None = None,
+    binning: int = 1,
+    roi: Region | None = None,
+    voxel_size: float | None = None,
+    window: str = "ram-lak",
+) -> Reconstruction:
     """Reconstruct a volume, and hand it on some planes at a time.
 
     Parameters
     ----------
     target : PlaneWriter
-        Takes the planes, each once; `open_volume` gives one that writes a
-        file.
-    scan, method, grid, motion, align, device, alignment, valid_views, progress, \
-    max_device_memory, max_host_memory, options
+        Takes the planes, each once; `open_volume` gives one that writes a file.
+    scan, method, grid, motion, align, device, alignment, valid_views, options, progress, \
+    checkpoint, resume, max_device_memory, max_host_memory, corrections, binning, roi, voxel_size, \
+    window
         As :func:`reconstruct` takes them.
+
+    Returns
+    -------
+    Reconstruction
 
     Raises
     ------
@@ -151,44 +217,80 @@ def reconstruct_into(
     """
     if method not in METHODS:
         raise InputError(f"method: found {method!r}, expected one of {METHODS}")
+    if window not in WINDOWS or (window != "ram-lak" and method != "fbp"):
+        raise InputError(f"window: found {window!r}, expected one of {WINDOWS} with method 'fbp'")
+    if binning > 1 and align and method == "imgr":
+        raise InputError(f"binning: found {binning} where imgr aligns, expected 1; align before")
     if align + (motion is not None) + (alignment is not None) > 1:
         raise InputError("motion, alignment and align: found more than one, expected one of them")
     if alignment is not None:
         motion = alignment.motion
         valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
-        valid_views = believed_views(valid_views, scan.views)
-    iterative.sorted_options(method, options)  # refuses what is wrong before the long work
-    motion = None if motion is None else motion.about(*scan.window_offset)
-    scan = scan.cropped()
-    grid = grid or default_grid(scan.geometry)
-    devices = usable_devices(device, progress)
-    limits: dict[str, Any] = {
-        "max_device_memory": max_device_memory,
-        "max_host_memory": max_host_memory,
-    }
-    stream = Stream(devices[0], report=progress, **limits)
-    fitted: Exact | None = None
-    if method == "katsevich":
-        # What it cannot treat it refuses before the long work.
-        whole = without_gaps(scan, valid_views)
-        fitted = exact_helices(Radiographs(stream, whole, 1), whole.geometry, grid)
-    if align and method != "imgr":
-        aligned = align_scan(scan, device=devices[0], progress=progress, **limits)
-        motion = aligned.motion
-        valid_views = aligned.valid_views
-    if fitted is not None:
-        _warn_of_gaps(fitted, grid, scan.views if valid_views is None else int(valid_views.sum()))
-    notes = []
-    if method == "fbp":
-        notes = [part_of_a_turn(scan.geometry), steep_rows(scan.geometry)]
-    if method != "katsevich":  # that refuses such samples
-        notes.append(truncated(Radiographs(stream, scan, 1)))
-    for note in filter(None, notes):
-        warnings.warn(note, stacklevel=2)
-    if method in iterative.METHODS:
-        iterative.iterate(stream, target, scan, method, grid, motion, align, valid_views, options)
-        return
+        valid_views = checked_valid_views(valid_views, scan.views)
+    options = iterative.checked_options(method, options)
+    keeping, own = checkpoint_of(checkpoint, resume)
+    if keeping is not None and keeping.resume and options is None and not align:
+        raise InputError(f"resume: found it with {method} alone, which keeps nothing on its way")
+    with collected() as findings:
+        devices = usable_devices(device, progress)
+        scan = prepared(scan, corrections, progress=progress)
+        motion = None if motion is None else motion.about(*scan.window_offset)
+        scan = scan.cropped()
+        small = binned_scan(scan, binning)
+        grid = grid or volume_grid(small.geometry, roi=roi, voxel_size=voxel_size)
+        limits: dict[str, Any] = {
+            "max_device_memory": max_device_memory,
+            "max_host_memory": max_host_memory,
+        }
+        stream = Stream(devices[0], report=progress, **limits)
+        fitted: Exact | None = None
+        if method == "katsevich":
+            # What it cannot treat it refuses before the long work.
+            whole = without_gaps(small, valid_views)
+            fitted = exact_helices(Radiographs(stream, whole, 1), whole.geometry, grid)
+        if align and method != "imgr":
+            begun = None if keeping is None else keeping.part("alignment")
+            if keeping is not None and begun is not None:
+                if options is None and keeping.resume and not begun.resume:
+                    raise InputError.at(begun.folder, "checkpoint", "none", "one to go on from")
+                keeping.resume = keeping.there if begun.resume else keeping.resume
+            alignment = align_scan(
+                scan, device=devices[0], progress=progress, checkpoint=begun, **limits
+            )
+            motion, valid_views = alignment.motion, alignment.valid_views
+        if motion is not None:
+            motion = binned_motion(motion, binning, scan.geometry.shape)
+        scan = small
+        _warn_of_scan(stream, scan, method)
+        if fitted is not None:
+            there = scan.views if valid_views is None else int(valid_views.sum())
+            _warn_of_gaps(fitted, grid, there)
+        steps: tuple[ImgrStep, ...] = ()
+        if options is not None:
+            request = iterative.Request(scan, grid, motion, align, valid_views, options)
+            steps, found = iterative.iterate(stream, target, request, keeping)
+            alignment = found or alignment
+        else:
+            work = _work(scan, grid, motion, valid_views, fitted, window)
+            if len(devices) == 1:
+                work(stream, slice(0, grid.shape[0]), target)
+            else:
+                on_devices(devices, work, grid.shape[0], target, progress=progress, **limits)
+    if own and keeping is not None and not cancelled(findings):
+        keeping.clear()
+    return Reconstruction(tuple(findings), steps, alignment)
+
+
+def _work(
+    scan: Scan,
+    grid: VolumeGrid,
+    motion: Motion | None,
+    valid_views: NDArray[np.bool_] | None,
+    fitted: Exact | None,
+    window: str,
+) -> Work:
+    """Return what reconstructs some planes: by Katsevich's method if helices are given."""
 
     def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
         if fitted is not None:
@@ -206,14 +308,25 @@ def reconstruct_into(
                 geometry,
                 grid,
                 valid_views=valid_views,
+                window=window,
                 planes=planes,
                 target=target,
             )
 
-    if len(devices) == 1:
-        work(stream, slice(0, grid.shape[0]), target)
-    else:
-        on_devices(devices, work, grid.shape[0], target, progress=progress, **limits)
+    return work
+
+
+def _warn_of_scan(stream: Stream, scan: Scan, method: str) -> None:
+    """Warn of what a method makes less of than a scan's users may think."""
+    notes = {}
+    if method == "fbp":
+        notes["short-scan"] = part_of_a_turn(scan.geometry)
+        notes["cone-angle"] = steep_rows(scan.geometry)
+    if method != "katsevich":  # that refuses such samples
+        notes["truncation"] = truncated(Radiographs(stream, scan, 1), scan.geometry)
+    for code, note in notes.items():
+        if note:
+            Finding(code, note).warn()
 
 
 def _warn_of_gaps(fitted: Exact, grid: VolumeGrid, there: int) -> None:
@@ -221,17 +334,17 @@ def _warn_of_gaps(fitted: Exact, grid: VolumeGrid, there: int) -> None:
     helical = fitted[0]
     needed = sum(views.stop - views.start for views, _ in helical)
     if there < needed:
-        warnings.warn(
+        Finding(
+            "missing-views",
             f"katsevich needs every view: {needed - there} of {needed} that are missing or "
             "rejected are interpolated from their neighbours",
-            stacklevel=3,
-        )
+        ).warn()
     between = heights_between([helix for _, helix in helical], grid)
     if between is not None:
         ends = ", ".join(f"{views.start} to {views.stop - 1}" for views, _ in helical)
-        warnings.warn(
+        Finding(
+            "missing-heights",
             f"katsevich: none of {len(helical)} helices (views {ends}) holds the pi-intervals of "
             f"heights {between[0]:.4g} to {between[1]:.4g} mm between them, which are 0; if views "
             "are missing there, use method 'fbp'",
-            stacklevel=3,
-        )
+        ).warn()

@@ -82,7 +82,7 @@ def residuals(
         )
         back = np.column_stack([-moved[:, :2] / moved[:, 2:], 1 / moved[:, 2]])
     for views in stream.chunks(simulated.shape[0], radiographs.view_bytes):
-        measured = stream.upload(radiographs.read(views))
+        measured = radiographs.on_device(stream, views)
         made = stream.empty(measured.shape)
         made.set(simulated.read(views.start, views.stop), queue=queue)
         motion = stream.upload(np.ascontiguousarray(back[views], np.float32))

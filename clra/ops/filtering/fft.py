@@ -4,7 +4,6 @@ On a CPU device the buffers are host memory, and scipy's pocketfft is 7 to 70 ti
 OpenCL FFT kernels there.
 """
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -13,6 +12,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.errors import InputError
+from clra.findings import warn
 from clra.ops.filtering.fft_device import DeviceFFT, NoPlanError
 from clra.ops.filtering.fft_host import HostFFT
 from clra.ops.runtime.buffers import Allocator, check_array, check_queue
@@ -102,7 +102,7 @@ class RealFFT:
             try:
                 transform = DeviceFFT(context, shape, tuple(axes), allocator)
             except NoPlanError as error:  # a device of small work-groups
-                warnings.warn(f"{error}: transforms run on the host, slowly", stacklevel=2)
+                warn("slow-transforms", f"{error}: transforms run on the host, slowly")
             else:
                 self.scratch_bytes = transform.scratch_bytes
                 self._backend = transform

@@ -100,7 +100,8 @@ class KatsevichFilter:
         self._rows_of_lines = to_device(context, np.stack([at_first, at_second - at_first], axis=1))
         self.padded = fast_length(context, 2 * columns, backend)
         self._hilbert = to_device(context, _spectrum(helix, self.padded), np.complex64)
-        self._lanes = profile_of(context).image_lanes
+        profile = profile_of(context)
+        self._lanes = profile.image_lanes
         self._stride = 8 * -(-columns // 8)
         self._lines_of_rows = to_device(context, _line_positions(helix, psi, window, self._stride))
         most = within(profile_of(context).filter_bytes, scratch_limit) // (4 * self.padded)
@@ -113,7 +114,7 @@ class KatsevichFilter:
         self._fft = RealFFT(context, transformed, (2,), backend, allocator=memory)
         self.scratch_bytes = self._image.nbytes + self._lines.nbytes + self._fft.scratch_bytes
         self._steps = [
-            Step(context, "katsevich_filter.cl", name, (32, 1, 1), {"LANES": self._lanes})
+            Step(context, "katsevich_filter.cl", name, profile.image_group, {"LANES": self._lanes})
             for name in ("differentiate", "take_lines", "put_lines")
         ]
         self._last: list[cl.Event] = []

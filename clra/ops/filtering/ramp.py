@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pyopencl as cl
@@ -10,7 +11,9 @@ from pyopencl.array import Array
 
 from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.sampling.ray_weights import RayWeights, widened
 from clra.ops.filtering.fft import RealFFT, fast_length
+from clra.ops.filtering.ramp_transform import RampTransform, transform_length
 from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
 from clra.ops.runtime.kernel import Step
@@ -25,8 +28,8 @@ FADE = 0.1
 # Some drivers take no more than 65535 work-groups along a range's second and third axes.
 _MOST_LINES = 1 << 15
 
-# Part of the columns over which `extend` continues a truncated row on each side.
-_EXTENSION = 0.2
+# Past this part of its columns a row is not continued: padded lines would only grow.
+_MOST_EXTENSION = 4.0
 
 
 def taper(rows: int, fraction: float) -> NDArray[np.float32]:
@@ -65,10 +68,9 @@ class RampFilter:
 
     Of radiographs p of line integrals it makes ``q = R / (SDD |u'|) (p w r) * h`` with R the
     distance from source to axis, SDD that to the detector, u' what of u is across the way to the
-    axis (all of it, if the detector faces the axis), w SDD over the length of the ray, r the row
-    and view weights, and h the band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for odd
-    n, 0 for even n. With
-    depth fractions g(x) and summed row weights W(x) the attenuation is then
+    axis (all of it, if the detector faces the axis), w SDD over the length of the ray, r the row,
+    ray and view weights, and h the band-limited ramp, ``h[0] = 1/4``, ``h[n] = -1 / (pi n)^2`` for
+    odd n, 0 for even n. With depth fractions g(x) and summed row weights W(x) the attenuation is
     ``f(x) = pi / W(x) sum_i q_i(x) / g_i(x)^2`` for views around the whole circle. [1]_
 
     Parameters
@@ -81,12 +83,16 @@ class RampFilter:
         (rows,) weights of the detector's rows, see :func:`taper`; 1 by default.
     view_weight : array_like, optional
         (views,) weights of the radiographs as a whole; 1 by default.
+    ray_weights : RayWeights, optional
+        Of redundant rays; 1 by default. Past the near side of an offset detector rays weigh
+        nothing, but the filter's tails count: filtered radiographs are wider there.
     window : {"ram-lak", "shepp-logan", "hann"}
         What the ramp's spectrum is multiplied by: nothing, a sinc, or a raised cosine that is 0 at
         the Nyquist frequency.
-    extend : bool
-        Continue each row past the detector, a fifth of its length on each side, from its outermost
-        value to 0 as a squared cosine: for samples that are wider than the detector.
+    extend : float
+        Continue each row past the detector, by this part of its columns on each side, from its
+        outermost value to 0 as the chords of a circle do: for samples that are wider than the
+        detector.
     backend : {"scipy", "reikna"}, optional
         As for :class:`clra.ops.filtering.fft.RealFFT`; with "scipy" a call blocks the host.
     allocator : callable, optional
@@ -98,6 +104,8 @@ class RampFilter:
     ----------
     window : str
         As given.
+    geometry : ConeBeamGeometry
+        Of the filtered radiographs.
     padded : int
         Columns of a line in the transforms, at least twice those of the detector.
     scratch_bytes : int
@@ -121,19 +129,47 @@ class RampFilter:
         *,
         row_weight: ArrayLike | None = None,
         view_weight: ArrayLike | None = None,
+        ray_weights: RayWeights | None = None,
         window: str = "ram-lak",
-        extend: bool = False,
+        extend: float = 0.0,
         backend: str | None = None,
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
     ) -> None:
+        if not 0 <= extend <= _MOST_EXTENSION:
+            raise InputError(f"extend: found {extend}, expected 0 to {_MOST_EXTENSION:g}")
         if window not in WINDOWS:
             raise InputError(f"window: found {window!r}, expected one of {', '.join(WINDOWS)}")
         self.window = window
         self._context = context
         self._views, self._rows, self._columns = geometry.views, geometry.rows, geometry.columns
-        margin = math.ceil(_EXTENSION * self._columns) if extend else 0
-        self.padded = fast_length(context, 2 * (self._columns + margin), backend)
+        margin = math.ceil(extend * self._columns)
+        self._wider = (0, 0) if ray_weights is None else ray_weights.beyond
+        least = 2 * (self._columns + margin + max(self._wider))
+        length = transform_length(context, least) if backend is None else None
+        self.padded = length or fast_length(context, least, backend)
+        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
+        self._view_weight = view_weights(view_weight, self._views)
+        self._ray_weights = ray_weights
+        self._alike = to_device(context, np.ones(self._columns))
+        self._roll = to_device(context, _roll(self.padded - self._columns, margin, self._columns))
+        self._last: list[cl.Event] = []
+        self.set_geometry(geometry)
+        spectrum = _ramp_spectrum(self.padded, window)
+        self._transform = RampTransform(context, spectrum) if length else None
+        self.scratch_bytes = 0
+        if length is None:
+            self._in_steps(context, spectrum, backend, allocator, scratch_limit)
+
+    def _in_steps(
+        self,
+        context: cl.Context,
+        spectrum: NDArray[np.float32],
+        backend: str | None,
+        allocator: Allocator | None,
+        scratch_limit: int | None,
+    ) -> None:
+        """Prepare to weigh lines, to transform them and to cut them out."""
         self._lanes = profile_of(context).image_lanes
         most = within(profile_of(context).filter_bytes, scratch_limit) // (4 * self.padded)
         lines = (min(self._views * self._rows, max(1, most), _MOST_LINES), 1, self.padded)
@@ -144,12 +180,11 @@ class RampFilter:
         defines = {"LANES": self._lanes}
         self._weight = Step(context, "ramp.cl", "weight_lines", (64, 2), defines)
         self._cut = Step(context, "ramp.cl", "cut_lines", (64, 2), defines)
-        self._row_weight = to_device(context, _row_weights(row_weight, self._rows))
-        self._view_weight = view_weights(view_weight, self._views)
-        self._roll = to_device(context, _roll(self.padded - self._columns, margin))
-        self._ramp = to_device(context, _ramp_spectrum(self.padded, window))
-        self._last: list[cl.Event] = []
-        self.set_geometry(geometry)
+        self._ramp = to_device(context, spectrum)
+
+    def filtered_geometry(self, geometry: ConeBeamGeometry) -> ConeBeamGeometry:
+        """Return the geometry of the filtered radiographs of a geometry that is to be set."""
+        return widened(geometry, *self._wider)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
         """Take a geometry of the same views and shape, for example with another motion.
@@ -160,6 +195,9 @@ class RampFilter:
             If views or shape differ.
         """
         check_geometry(geometry, (self._views, self._rows, self._columns))
+        self.geometry = self.filtered_geometry(geometry)
+        if self._ray_weights is not None:
+            self._ray_weights = replace(self._ray_weights, geometry=geometry)
         self._view_table = to_device(self._context, _view_table(geometry, self._view_weight))
 
     def __call__(
@@ -178,7 +216,8 @@ class RampFilter:
         queue : cl.CommandQueue
             In order or out of order.
         filtered_out : cl.array.Array
-            float32 (n, rows, columns) [1/mm], overwritten; may be `projections` itself.
+            float32 (n, rows, columns) of :attr:`geometry` [1/mm], overwritten; may be `projections`
+            itself if that is not wider.
         projections : cl.array.Array
             float32 (n, rows, columns), line integrals.
         views : slice, optional
@@ -199,10 +238,22 @@ class RampFilter:
         start, stop = successive(views, self._views)
         shape = (stop - start, self._rows, self._columns)
         check_array("projections", projections, shape, context=self._context)
-        check_array("filtered_out", filtered_out, shape, context=self._context)
+        filtered_shape = (shape[0], *self.geometry.shape)
+        check_array("filtered_out", filtered_out, filtered_shape, context=self._context)
         total = shape[0] * self._rows
         events = [*(wait_for or ()), *self._last]
         sizes = (self._columns, self.padded)
+        rays, stride = self._alike, 0
+        if self._ray_weights is not None:
+            table = self._ray_weights.at(np.arange(self._columns), slice(start, stop))
+            rays, stride = to_device(self._context, table), self._columns
+        if self._transform is not None:
+            tables = self._view_table[start:], self._row_weight, rays, self._roll
+            event = self._transform(
+                queue, filtered_out, projections, tables, stride, self._wider[0], events
+            )
+            self._last = [event]
+            return event
         for first in range(0, total, len(self._lines)):
             count = min(len(self._lines), total - first)
             part = self._lines[:count]
@@ -213,22 +264,26 @@ class RampFilter:
                 projections,
                 self._view_table[start:],
                 self._row_weight,
+                rays,
                 self._roll,
                 first,
                 count,
                 self._rows,
                 *sizes,
+                stride,
                 wait_for=events,
             )
             event = self._fft.apply(queue, part, part, self._ramp, [event])
             event = self._cut(
                 queue,
-                (-(-self._columns // self._lanes), count),
+                (-(-self.geometry.columns // self._lanes), count),
                 filtered_out,
                 part,
                 first,
                 count,
-                *sizes,
+                self.geometry.columns,
+                self.padded,
+                self._wider[0],
                 wait_for=[event],
             )
             events = [event]
@@ -267,10 +322,13 @@ def _view_table(
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def _roll(length: int, margin: int) -> NDArray[np.float64]:
+def _roll(length: int, margin: int, columns: int) -> NDArray[np.float64]:
     """Weights between the end of a row and, cyclically, its start: down to 0, and up again."""
     weights = np.zeros(length)
-    weights[:margin] = np.cos(np.pi / 2 * np.arange(1, margin + 1) / (margin + 1)) ** 2
+    radius, edge = columns / 2 + margin, columns / 2
+    distance = edge + np.arange(margin) + 0.5
+    if margin:
+        weights[:margin] = np.sqrt((radius**2 - distance**2) / (radius**2 - edge**2))
     return np.maximum(weights, weights[::-1])
 
 

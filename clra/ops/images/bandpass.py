@@ -125,7 +125,8 @@ class Bandpass:
         self._mask = to_device(context, lined(counts))
         self._scale = to_device(context, lined(reciprocal(counts, narrow)))
         self._fit = to_device(context, np.stack([lined(image) for image in plane_fit(means, wide)]))
-        self._lanes = profile_of(context).image_lanes
+        profile = profile_of(context)
+        self._lanes = profile.image_lanes
         weights, bases = spline_table(columns, factor, self._lanes, _RIM)
         self._weights, self._bases = (
             to_device(context, lined(weights)),
@@ -142,7 +143,7 @@ class Bandpass:
         self._last: list[cl.Event] = []
 
         self._steps = {
-            name: Step(context, "bandpass.cl", name, (32, 1, 1), {"LANES": self._lanes})
+            name: Step(context, "bandpass.cl", name, profile.image_group, {"LANES": self._lanes})
             for name in (
                 "block_means",
                 "wide_rows",

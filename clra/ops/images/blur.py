@@ -55,9 +55,10 @@ class Blur:
             to_device(context, taps),
             to_device(context, lined(1 / part[None])),
         )
-        self._lanes = profile_of(context).image_lanes
+        profile = profile_of(context)
+        self._lanes = profile.image_lanes
         self._rows, self._columns = (
-            Step(context, "blur.cl", name, (32, 1, 1), {"LANES": self._lanes})
+            Step(context, "blur.cl", name, profile.image_group, {"LANES": self._lanes})
             for name in ("blur_rows", "blur_columns")
         )
 

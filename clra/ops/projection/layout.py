@@ -17,7 +17,7 @@ from clra.model.grid import VolumeGrid
 from clra.ops.projection.transpose import Planes, Transpose
 from clra.ops.projection.view_arguments import check_geometry, successive
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
-from clra.ops.runtime.profile import profile_of
+from clra.ops.runtime.profile import DeviceProfile, profile_of
 
 _PAD = 24  # as in geometry.clh
 _PIECE = 32  # the most that kernels read from where they are, past the last line's end
@@ -42,6 +42,9 @@ class Layout:
         Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
     scratch_limit : int, optional
         Bytes of scratch for projections; fewer views are treated at a time, at least one.
+    weighs : bool
+        Whether projections are changed before they are used, so that a GPU too needs scratch for
+        them; CPUs always do.
 
     Attributes
     ----------
@@ -50,7 +53,11 @@ class Layout:
     lanes : {1, 8, 16}
         Its ``projector_lanes``.
     columnar : bool
-        Whether the kernels for columns apply, to a CPU, v parallel to z and no steep ray.
+        Whether the kernels for v parallel to z apply, where besides no ray is steep.
+    leaning : bool
+        Whether no ray is steep and v is within 45 degrees of z.
+    heights : ndarray
+        (views, 2) voxels along z that each view sees: the first, and one past the last.
     steep : bool
         Whether rays may advance fastest along z.
     table : Array
@@ -73,6 +80,8 @@ class Layout:
         volume_order: str,
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
+        *,
+        weighs: bool = False,
     ) -> None:
         self.profile = profile = profile_of(context)
         self.context = context
@@ -80,7 +89,8 @@ class Layout:
         self.lanes = profile.projector_lanes
         self.sizes = grid.shape[::-1]
         self.detector = (geometry.columns, geometry.rows, _pitch(geometry.rows))
-        self._view_elements = view_elements(geometry.shape)
+        self._view_shape = view_shape(self.profile, geometry.shape)
+        self._view_elements = self._view_shape[0] * self._view_shape[1]
         self.last: list[cl.Event] = []
         self._views = geometry.views
         self.volume_order = volume_order
@@ -92,7 +102,7 @@ class Layout:
         self._volume: Array | None = None
         self._memory = Scratch(context, allocator)
         lines = min(geometry.views, self._most) * self._view_elements
-        self.scratch_bytes = 4 * (lines + _PIECE)
+        self.scratch_bytes = 4 * (lines + _PIECE) if profile.on_cpu or weighs else 0
         if volume_order == "zyx":
             self.scratch_bytes += 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
         self.set_geometry(geometry)
@@ -102,9 +112,9 @@ class Layout:
         check_geometry(geometry, (self._views, self.detector[1], self.detector[0]))
         self.table = to_device(self.context, view_table(geometry, self.grid))
         self.steep = _steep(geometry)
-        self.columnar = (
-            self.profile.columns and self.lanes > 1 and geometry.axial and not self.steep
-        )
+        self.columnar = self.profile.columns and geometry.axial and not self.steep
+        self.leaning = not self.steep and _leaning(geometry)
+        self.heights = heights(geometry, self.grid)
 
     def check(
         self,
@@ -171,12 +181,11 @@ class Layout:
         )
 
     def scratch_projections(self, count: int) -> Array:
-        """Lines of `count` views, (count, columns + 1, pitch)."""
-        columns, _, pitch = self.detector
+        """Lines of `count` views, (count, columns + 1, pitch), on a GPU (count, rows, columns)."""
         if self._lines is None or len(self._lines) < count:
-            size = count * (columns + 1) * pitch
+            size = count * self._view_elements
             flat = self._memory.empty((size + _PIECE,))
-            self._lines = flat[:size].reshape(count, columns + 1, pitch)
+            self._lines = flat[:size].reshape(count, *self._view_shape)
         lines: Array = self._lines[:count]
         return lines
 
@@ -227,9 +236,9 @@ def _pitch(rows: int) -> int:
     return 16 * -(-(rows + 2 * _PAD) // 16)
 
 
-def view_elements(shape: tuple[int, int]) -> int:
-    """Elements of the padded lines of a view of (rows, columns)."""
-    return (shape[1] + 1) * _pitch(shape[0])
+def view_shape(profile: DeviceProfile, shape: tuple[int, int]) -> tuple[int, int]:
+    """Shape of a view of (rows, columns) in scratch: padded lines on CPUs."""
+    return (shape[1] + 1, _pitch(shape[0])) if profile.on_cpu else shape
 
 
 def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
@@ -244,6 +253,32 @@ def volume_shape(grid: VolumeGrid, order: str) -> tuple[int, int, int]:
         raise InputError(f"volume_order: found {order!r}, expected 'zyx' or 'yxz'")
     nz, ny, nx = grid.shape
     return (nz, ny, nx) if order == "zyx" else (ny, nx, nz)
+
+
+def heights(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.int64]:
+    """Voxels along z that each view sees, (views, 2): the first, and one past the last.
+
+    Those of axial views; of others all.
+    """
+    nz, ny, nx = grid.shape
+    if not geometry.axial:
+        return np.tile([0, nz], (geometry.views, 1))
+    matrices = geometry.projection_matrices() @ grid.index_to_world()
+    # The height at which a ray of row r passes is linear along x and y: corners are outermost.
+    b, g = matrices[:, 1, :, None], matrices[:, 2, :, None, None]
+    x, y = np.array([0.0, nx - 1, 0, nx - 1]), np.array([0.0, 0, ny - 1, ny - 1])
+    row = np.array([0.0, geometry.rows - 1])[:, None]
+    depth = g[:, 0] * x + g[:, 1] * y + g[:, 3]
+    at = (row * depth - (b[:, 0] * x + b[:, 1] * y + b[:, 3])[:, None]) / b[:, 2, None]
+    low = np.clip(np.floor(at.min(axis=(1, 2))), 0, nz)
+    high = np.clip(np.ceil(at.max(axis=(1, 2))) + 1, 0, nz)
+    return np.stack([low, high], axis=1).astype(np.int64)
+
+
+def _leaning(geometry: ConeBeamGeometry) -> bool:
+    """Whether every view's rows follow each other within 45 degrees of z."""
+    level = np.linalg.norm(geometry.v[:, :2], axis=1)
+    return bool(np.all(np.abs(geometry.v[:, 2]) > level))
 
 
 def _steep(geometry: ConeBeamGeometry) -> bool:

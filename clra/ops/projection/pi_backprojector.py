@@ -10,6 +10,7 @@ from pyopencl.array import Array
 from clra.model.grid import VolumeGrid
 from clra.model.helix.helix import Helix
 from clra.model.helix.pi_intervals import pi_reach, pi_spans
+from clra.ops.projection.gpu_forms import size_constants
 from clra.ops.projection.layout import Layout
 from clra.ops.runtime.buffers import Allocator, to_device
 from clra.ops.runtime.kernel import Step
@@ -17,6 +18,7 @@ from clra.ops.runtime.kernel import Step
 # Voxels along z that a work-item of a CPU sums. A view sees a short part of the volume: of longer
 # blocks much is idle.
 _VOXELS = 256
+_GPU_VOXELS = 8
 
 # Columns of voxels along x that a CPU treats for all y before it goes on, so that what they see of
 # the projections stays in the cache. All 320 of a volume take a third longer.
@@ -82,12 +84,14 @@ class PiBackProjector:
             scratch_limit=scratch_limit,
         )
         self.scratch_bytes = self._layout.scratch_bytes
-        block = _VOXELS if self._layout.lanes > 1 else 1
-        local = (1, 1, 1) if self._layout.lanes > 1 else (32, 8, 1)
-        defines = {"LANES": self._layout.lanes, "BLOCK": block}
-        self._block = block
-        self._strip = _STRIP if self._layout.lanes > 1 else grid.shape[2]
-        self._step = Step(context, "pi_backprojector.cl", "pi_backproject", local, defines)
+        if self._layout.profile.on_cpu:
+            defines = {"LANES": self._layout.lanes, "BLOCK": _VOXELS}
+            file, kernel = "pi_backprojector_columns.cl", "pi_columns"
+            self._step = Step(context, file, kernel, (1, 1, 1), defines)
+        else:
+            constants = {**size_constants(self._layout), "VOXELS": _GPU_VOXELS}
+            file, kernel = "pi_backprojector.cl", "pi_backproject"
+            self._step = Step(context, file, kernel, (32, 8, 1), constants)
         columns = np.arange(own.shape[1] + 1)
         borders = np.sort(own.row(np.stack(own.window(own.tangent_u(columns)), axis=1)), axis=1)
         self._window = to_device(context, borders)
@@ -138,27 +142,36 @@ class PiBackProjector:
             bottom, top = self._seen(start + first, start + last)
             if top <= bottom:
                 continue
-            lines, event = layout.gather_projections(queue, projections[first:last], events)
+            part = projections[first:last]
+            if layout.profile.on_cpu:
+                part, event = layout.gather_projections(queue, part, events)
+                events = [event]
+                size = -(-(top - bottom) // _VOXELS), _STRIP, ny * -(-nx // _STRIP)
+                pitch, strip = [layout.detector[2]], [_STRIP]
+            else:
+                size = nx, ny, -(-(top - bottom) // _GPU_VOXELS)
+                pitch, strip = [], []
             event = self._step(
                 queue,
-                (-(-(top - bottom) // self._block), self._strip, ny * -(-nx // self._strip)),
+                size,
                 volume_out,
-                lines,
+                part,
                 layout.table[start + first : start + last],
                 self._window,
                 self._spans,
                 nx,
                 ny,
                 nz,
-                *layout.detector,
+                *layout.detector[:2],
+                *pitch,
                 last - first,
                 len(self._helices),
                 self._helix,
                 bottom,
                 top,
-                self._strip,
+                *strip,
                 abs(own.z_step) / layout.grid.voxel_size,
-                wait_for=[event],
+                wait_for=events,
             )
             events = [event]
         layout.last = [event]

@@ -4,31 +4,17 @@ Projections are (view, row, column) and volumes (z, y, x), or (y, x, z) for ``vo
 the order that the kernels work in.
 """
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 
 import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.ops.projection.kernel_forms import Blocks
+from clra.ops.projection.cpu_forms import CpuAdjoint, CpuBack, CpuForward
+from clra.ops.projection.gpu_forms import GpuAdjoint, GpuBack, GpuForward
 from clra.ops.projection.layout import Layout
 from clra.ops.runtime.buffers import Allocator
-from clra.ops.runtime.kernel import Step
-
-# The most that a work-item of a CPU makes: rows or voxels of a line, and for the adjoint columns
-# beside each other, whose sums have to fit the first cache. Of 448 voxels, blocks of 256 cost a
-# sixth of the speed, of 128 a third.
-_LINE = 1024
-_ADJOINT_LINE, _WIDTH = 512, 16
-# Columns of voxels that a CPU back-projects for all y before it goes on, as in the kernels.
-_STRIP = 32
-
-# Part of the volume that a CPU projects for all views of a launch before it goes on: at twice the
-# size it begins to fall out of the caches, the whole of 256^3 voxels takes twice as long.
-_PART_BYTES = 2 << 20
-_LEAST_PLANES = 4
 
 
 class ForwardProjector:
@@ -70,8 +56,6 @@ class ForwardProjector:
        Trans. Med. Imaging 1, 192 (1982).
     """
 
-    _DEFINES: Mapping[str, object] = MappingProxyType({})  # of the kernels
-
     def __init__(
         self,
         context: cl.Context,
@@ -84,16 +68,8 @@ class ForwardProjector:
     ) -> None:
         self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
         self.scratch_bytes = self._layout.scratch_bytes
-        kernels = ("forward_rays", "forward_columns", "forward_tilted")
-        self._project = Blocks(
-            self._layout, "forwardproject", kernels, geometry.rows, _LINE, self._DEFINES
-        )
-        nz, ny, nx = grid.shape
-        planes = max(nz, ny, nx)
-        thick = planes
-        if self._layout.lanes > 1:
-            thick = max(_LEAST_PLANES, _PART_BYTES // (4 * nz * max(nx, ny)))
-        self._parts = [(a, min(a + thick, planes)) for a in range(0, planes, thick)]
+        on_cpu = self._layout.profile.on_cpu
+        self._project = CpuForward(self._layout) if on_cpu else GpuForward(self._layout)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
         """Take other vectors for the same views and detector, for example another motion.
@@ -141,53 +117,14 @@ class ForwardProjector:
         TypeError, InputError
             If an argument is none of the above.
         """
-        return self.integrals(
-            queue,
-            (projections_out,),
-            volume,
-            views=views,
-            accumulate=accumulate,
-            wait_for=wait_for,
-        )
-
-    def integrals(
-        self,
-        queue: cl.CommandQueue,
-        outputs: tuple[Array, ...],
-        volume: Array,
-        *,
-        views: slice | None = None,
-        accumulate: bool = False,
-        wait_for: Sequence[cl.Event] | None = None,
-    ) -> cl.Event:
-        """Fill what the kernels make of each ray: one integral for this class, see `__call__`."""
         layout = self._layout
         names = ("volume", "projections_out")
-        start, stop = layout.check(queue, names, volume, outputs[0], views)
+        start, stop = layout.check(queue, names, volume, projections_out, views)
         events: Sequence[cl.Event] = [*(wait_for or ()), *layout.last]
         columns, events = layout.gather_volume(queue, volume, events)
-        for first, last in layout.batches(stop - start, len(outputs)):
-            lines = layout.scratch_projections(len(outputs) * (last - first))
-            for planes in self._parts:
-                event = self._project(
-                    queue,
-                    (layout.detector[0], last - first),
-                    lines,
-                    columns,
-                    slice(start + first, start + last),
-                    *planes,
-                    layout.grid.voxel_size,
-                    wait_for=events,
-                )
-                events = [event]
-            layout.last = [
-                layout.scatter_projections(
-                    queue, out[first:last], accumulate, events, k * (last - first)
-                )
-                for k, out in enumerate(outputs)
-            ]
-            events = layout.last
-        return events[0] if len(events) == 1 else cl.enqueue_marker(queue, wait_for=events)
+        return self._project(
+            queue, projections_out, columns, slice(start, stop), accumulate, events
+        )
 
 
 class BackProjector:
@@ -240,20 +177,13 @@ class BackProjector:
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
     ) -> None:
-        self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
+        self._layout = Layout(
+            context, geometry, grid, volume_order, allocator, scratch_limit, weighs=matched
+        )
         self.scratch_bytes = self._layout.scratch_bytes
-        nz = grid.shape[0]
-        if matched:
-            kernels = ("adjoint_voxels", "adjoint_columns", "adjoint_tilted")
-            width = {"WIDTH": _WIDTH}
-            self._project = Blocks(self._layout, "adjoint", kernels, nz, _ADJOINT_LINE, width)
-            lanes = {"LANES": self._layout.lanes}
-            self._weigh = Step(context, "adjoint.cl", "weigh_rays", (64, 1, 1), lanes)
-        else:
-            kernels = ("backproject_voxels", "backproject_columns", "backproject_tilted")
-            strip = {"STRIP": _STRIP}
-            self._project = Blocks(self._layout, "backproject", kernels, nz, _LINE, strip)
-        self._matched = matched
+        on_cpu = self._layout.profile.on_cpu
+        back = (CpuAdjoint if on_cpu else GpuAdjoint) if matched else CpuBack if on_cpu else GpuBack
+        self._project = back(self._layout)
 
     def set_geometry(self, geometry: ConeBeamGeometry) -> None:
         """Take other vectors for the same views and detector, for example another motion.
@@ -308,59 +238,9 @@ class BackProjector:
         events: Sequence[cl.Event] = [*(wait_for or ()), *layout.last]
         columns = layout.scratch_volume(volume_out)
         direct = columns is volume_out
-        for first, last in layout.batches(stop - start):
-            lines, event = layout.gather_projections(queue, projections[first:last], events)
-            chosen = slice(start + first, start + last)
-            adds = int(first > 0 or (accumulate and direct))
-            if self._matched:
-                event = self._adjoint(queue, columns, lines, chosen, adds, event)
-            else:
-                event = self._project(
-                    queue, self._size(), columns, lines, chosen, adds, wait_for=[event]
-                )
-            layout.last = events = [event]
+        adds = accumulate and direct
+        event = self._project(queue, columns, projections, slice(start, stop), adds, events)
         if not direct:
-            event = layout.scatter_volume(queue, volume_out, accumulate, events)
+            event = layout.scatter_volume(queue, volume_out, accumulate, [event])
             layout.last = [event]
-        return event
-
-    def _size(self) -> tuple[int, int]:
-        """Global size across the columns."""
-        nx, ny, _ = self._layout.sizes
-        return (_STRIP, ny * -(-nx // _STRIP)) if self._layout.lanes > 1 else (nx, ny)
-
-    def _adjoint(
-        self,
-        queue: cl.CommandQueue,
-        columns: Array,
-        lines: Array,
-        views: slice,
-        adds: int,
-        event: cl.Event,
-    ) -> cl.Event:
-        """Weigh the projections in place and gather them."""
-        layout = self._layout
-        event = self._weigh(
-            queue,
-            (-(-layout.detector[1] // layout.lanes), layout.detector[0], len(lines)),
-            lines,
-            layout.table[views],
-            *layout.detector,
-            len(lines),
-            int(layout.columnar),
-            int(layout.lanes > 1 and not layout.columnar),
-            layout.grid.voxel_size,
-            wait_for=[event],
-        )
-        nx, ny, _ = layout.sizes
-        if layout.lanes == 1:
-            return self._project(queue, (nx, ny), columns, lines, views, adds, wait_for=[event])
-        for axis, size in enumerate([(nx, -(-ny // _WIDTH)), (ny, -(-nx // _WIDTH))]):
-            event = self._project(
-                queue, size, columns, lines, views, axis, max(adds, axis), wait_for=[event]
-            )
-        if layout.steep:
-            event = self._project(
-                queue, (nx, ny), columns, lines, views, 1, wait_for=[event], singly=True
-            )
         return event

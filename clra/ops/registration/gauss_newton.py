@@ -208,8 +208,9 @@ class Registration:
         if self._group == 1:
             defines["LANES"] = profile_of(context).image_lanes
         self._normal_equations = Step(context, *sums, (self._group, 1, 1), defines)
-        self._start = Step(context, "gauss_newton.cl", "start", (1,))
-        self._advance = Step(context, "gauss_newton.cl", "advance", (1,))
+        alone = (self._group,)  # work-items, of a view each
+        self._start = Step(context, "gauss_newton.cl", "start", alone)
+        self._advance = Step(context, "gauss_newton.cl", "advance", alone)
         self._nothing = to_device(context, np.zeros(views))
         self._last: list[cl.Event] = []
 

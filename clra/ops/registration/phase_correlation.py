@@ -81,7 +81,7 @@ class CorrelationPeak:
         self.simulated = memory.empty((views, rows, columns))
         self._spectra = [memory.empty(self._fft.spectrum_shape, np.complex64) for _ in range(2)]
         self._cross_power = Step(context, "phase_correlation.cl", "cross_power", (64,))
-        self._group = group(context, "phase_correlation.cl", "peak", 64)
+        self._group = group(context, "phase_correlation.cl", "peak", 256)
         shared = (self._group, 1), {"GROUP": self._group}
         self._whiten = Step(context, "phase_correlation.cl", "whiten", *shared) if whiten else None
         self._peak = Step(context, "phase_correlation.cl", "peak", *shared)
@@ -169,9 +169,10 @@ class CoarseShift:
         )
         half = weights[: rows // 2 * 2 : 2, : columns // 2 * 2 : 2]
         self._window = to_device(context, lined(half))
-        self._lanes = profile_of(context).image_lanes
+        profile = profile_of(context)
+        self._lanes = profile.image_lanes
         self._halve = Step(
-            context, "phase_correlation.cl", "halve", (32, 1, 1), {"LANES": self._lanes}
+            context, "phase_correlation.cl", "halve", profile.image_group, {"LANES": self._lanes}
         )
 
     def __call__(
@@ -261,7 +262,7 @@ class PhaseCorrelation:
         self._windows = [to_device(context, tukey(length, 0.35)) for length in shape]
         self._mean = [memory.empty((views,)) for _ in range(2)]
         self.scratch_bytes = memory.bytes
-        size = self._group = group(context, "phase_correlation.cl", "means", 64)
+        size = self._group = group(context, "phase_correlation.cl", "means", 256)
         self._means = Step(context, "phase_correlation.cl", "means", (size, 1), {"GROUP": size})
         self._windowed = Step(context, "phase_correlation.cl", "windowed", (32, 4, 1))
         self._last: list[cl.Event] = []

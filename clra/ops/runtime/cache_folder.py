@@ -9,11 +9,11 @@ import shutil
 import stat
 import sys
 import tempfile
-import warnings
 from functools import cache
 from pathlib import Path
 
-from clra.errors import ClraWarning, DeviceError
+from clra.errors import DeviceError
+from clra.findings import warn
 
 ROOM = 32 << 20  # bytes; PoCL's binaries of all kernels take about 10 MiB
 
@@ -46,11 +46,10 @@ def cache_folder() -> Path:
             temporary = _temporary_folder(f"{folder}: {problem}")
             os.environ["XDG_CACHE_HOME"] = str(temporary)
             os.environ.pop("POCL_CACHE_DIR", None)
-            warnings.warn(
+            warn(
+                "cache-folder",
                 f"{folder}: {problem}: verdicts and compiled kernels are kept in {temporary}; set "
                 "XDG_CACHE_HOME to a folder with room to keep them there",
-                ClraWarning,
-                stacklevel=2,
             )
             own = temporary / "clra"
             break

@@ -2,12 +2,12 @@
 
 import os
 import re
-import warnings
 from dataclasses import dataclass
 
 import pyopencl as cl
 
-from clra.errors import ClraWarning, DeviceError
+from clra.errors import DeviceError
+from clra.findings import warn
 from clra.ops.runtime import intel_driver, self_test
 from clra.ops.runtime.cache_folder import cache_folder
 from clra.progress import ProgressCallback
@@ -193,10 +193,8 @@ def usable_device(
     if device is None and not _asked_for():
         for other in others:
             if not _problem(other, found, progress):
-                warnings.warn(
-                    f"{problem}: {other.name.strip()} ({_driver(other)}) is used instead",
-                    ClraWarning,
-                    stacklevel=2,
+                warn(
+                    "device", f"{problem}: {other.name.strip()} ({_driver(other)}) is used instead"
                 )
                 return other
     raise DeviceError(

@@ -21,7 +21,8 @@ class Step:
     file, function : str
         Kernel file and kernel.
     local : sequence of int
-        Work-group wanted; halved until the queue's device allows it.
+        Work-group wanted; halved until all devices allow it. For GPUs the kernel is compiled for
+        it, as (``GROUP_X``, ``GROUP_Y``, 1).
     defines : mapping, optional
         Preprocessor definitions.
     """
@@ -35,9 +36,17 @@ class Step:
         defines: Mapping[str, object] | None = None,
     ) -> None:
         self._builds = builds(context)  # held, so that others find it
-        self._kernel = self._builds.kernel(file, function, defines)
-        self._wanted = tuple(local)
-        self._allowed: dict[cl.Device, tuple[int, ...]] = {}
+        self._local = tuple(local)
+        given: dict[str, object] = dict(defines or {})
+        required = not profile_of(context).on_cpu and "GROUP" not in given
+        asked: tuple[int, ...] = ()
+        while asked != self._local:
+            asked = self._local
+            if required:
+                given |= {"GROUP_X": asked[0], "GROUP_Y": (*asked, 1)[1]}
+            self._kernel = self._builds.kernel(file, function, given)
+            for device in context.devices:
+                self._local = work_group_size(self._kernel, device, self._local)
 
     def __call__(
         self,
@@ -58,11 +67,7 @@ class Step:
                 values.append(np.float32(argument))
             else:
                 values.append(np.int32(argument))
-        device = queue.device
-        local = self._allowed.get(device)
-        if local is None:
-            local = work_group_size(self._kernel, device, self._wanted)
-            self._allowed[device] = local
+        local = self._local
         return self._kernel(queue, global_size(size, local), local, *values, wait_for=wait_for)
 
 
@@ -88,11 +93,17 @@ def work_group_size(
     return tuple(sizes)
 
 
-def group(context: cl.Context, file: str, function: str, wanted: int) -> int:
+def group(
+    context: cl.Context,
+    file: str,
+    function: str,
+    wanted: int,
+    defines: Mapping[str, object] | None = None,
+) -> int:
     """Work-items that share a view: 1 on CPUs, else `wanted` or what the built kernel allows."""
     size = min(wanted, profile_of(context).reduction_group)
     while size > 1:
-        kernel = builds(context).kernel(file, function, {"GROUP": size})
+        kernel = builds(context).kernel(file, function, {**(defines or {}), "GROUP": size})
         if all(work_group_size(kernel, d, (size,)) == (size,) for d in context.devices):
             break
         size //= 2

@@ -15,7 +15,6 @@ Debian's 3.1 has the cure and another record; its version ends with the right na
 
 import ctypes
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,7 +22,7 @@ from pathlib import Path
 
 import pyopencl as cl
 
-from clra.errors import ClraWarning
+from clra.findings import warn
 
 ADVICE = (
     "this PoCL does not tell its compiler the CPU that its built-in functions were compiled for, "
@@ -59,7 +58,7 @@ def needs_pairing(device: cl.Device) -> bool:
     release = re.search(r"PoCL (\d+)\.", platform.version)
     return (
         "Portable Computing Language" in platform.name
-        and bool(device.type & cl.device_type.CPU)
+        and "x86_64-" in device.version
         and release is not None
         and int(release[1]) < 5
         and "DISTRO" in platform.version
@@ -89,7 +88,7 @@ def build_options(devices: Sequence[cl.Device]) -> list[str]:
     """
     names = [pair(device) for device in devices if needs_pairing(device)]
     if not all(names):
-        warnings.warn(ADVICE, ClraWarning, stacklevel=2)
+        warn("pocl", ADVICE)
     return [f"-DCLRA_POCL_CPU={name}" for name in dict.fromkeys(filter(None, names))]
 
 

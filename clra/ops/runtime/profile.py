@@ -24,6 +24,9 @@ class DeviceProfile:
         Elements along z, or rows, in a vector of the projectors' kernels.
     image_lanes : {2, 8}
         Columns in a vector of the kernels for images.
+    image_group : tuple of int
+        Work-group of the kernels for images. GPUs hold few groups at a time, which have to be large
+        to fill them.
     reduction_group : int
         Most work-items that share an image in a reduction; 1 on CPUs.
     fft : {"scipy", "reikna"}
@@ -35,6 +38,9 @@ class DeviceProfile:
         projectors' order, padded lines of the ramp and Katsevich filters, an image of each of the
         warp's two intermediates, everything in registration, and radiographs between two
         operations of an alignment step.
+    constant_sizes : bool
+        Whether sizes that addresses step by are constants of the kernels' builds. That saves a
+        tenth of the instructions and costs a build for each size.
     columns : bool
         Whether views whose v is parallel to z get kernels of their own. False serves tests: the
         kernels for any pose have to agree with them.
@@ -43,6 +49,7 @@ class DeviceProfile:
     form: Literal["cpu", "gpu"]
     projector_lanes: int
     image_lanes: int
+    image_group: tuple[int, int, int]
     reduction_group: int
     fft: Literal["scipy", "reikna"]
     shared_memory: bool
@@ -51,6 +58,7 @@ class DeviceProfile:
     warp_bytes: int
     registration_bytes: int
     step_bytes: int
+    constant_sizes: bool = False
     columns: bool = True
 
     @property
@@ -68,6 +76,7 @@ CPU = DeviceProfile(
     form="cpu",
     projector_lanes=8,
     image_lanes=8,
+    image_group=(32, 1, 1),
     reduction_group=1,
     fft="scipy",
     shared_memory=True,
@@ -81,7 +90,8 @@ GPU = DeviceProfile(
     form="gpu",
     projector_lanes=1,
     image_lanes=2,
-    reduction_group=64,
+    image_group=(32, 4, 1),
+    reduction_group=256,
     fft="reikna",
     shared_memory=False,
     projector_bytes=256 << 20,
@@ -89,6 +99,7 @@ GPU = DeviceProfile(
     warp_bytes=32 << 20,
     registration_bytes=512 << 20,
     step_bytes=256 << 20,
+    constant_sizes=True,
 )
 WIDE_CPU = replace(CPU, projector_lanes=16)  # with AVX-512
 

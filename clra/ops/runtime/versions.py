@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import metadata
-
 import pyopencl as cl
+
+import clra
 
 
 def versions(device: cl.Device) -> dict[str, str]:
@@ -15,12 +15,8 @@ def versions(device: cl.Device) -> dict[str, str]:
     device : cl.Device
         That the work runs on.
     """
-    try:
-        own = metadata.version("clra")
-    except metadata.PackageNotFoundError:
-        own = "unknown"  # run from a checkout that is not installed
     return {
-        "clra": own,
+        "clra": clra.__version__,
         "pyopencl": cl.VERSION_TEXT,
         "driver": f"{device.platform.name.strip()} {device.driver_version.strip()}",
     }

@@ -44,9 +44,9 @@ class Budgets:
 
     On the device a third is a slab of the volume, a quarter what operators need between their
     kernels, a quarter the radiographs of two chunks in flight, before and after an operation; the
-    rest is for tables. On the host a quarter is for what is kept (radiographs, slabs), a sixth for
-    chunks being read, of which the parts that are converted, checked and copied are there at once;
-    on a CPU device the other half is the device's.
+    rest is for tables, and for radiographs that stay. On the host a quarter is for what is kept
+    (radiographs, slabs), a sixth for chunks being read, of which the parts that are converted,
+    checked and copied are there at once; on a CPU device the other half is the device's.
 
     Attributes
     ----------
@@ -103,6 +103,11 @@ class Budgets:
         """Bytes of the radiographs that are worked on at a time."""
         wanted = max(_CHUNK_BYTES, _CHUNK_VIEWS * view_bytes)
         return min(wanted, self.device // 16, self.host // 64)
+
+
+def keeps(budgets: Budgets, shape: tuple[int, ...]) -> bool:
+    """Whether radiographs of that shape stay on a device that has memory of its own."""
+    return not budgets.shared and 4 * int(np.prod(shape)) <= budgets.device // 8
 
 
 class _Counted(cl.Buffer):

@@ -161,13 +161,20 @@ def add_update(stream: Stream, volume: Volume, update: Volume, step: float = 1.0
     step : float
         Factor of the update.
     """
-    correct = Step(stream.context, _FILE, "correct", (64, 1))
     for index in range(len(volume.planes)):
-        part, change = writable(stream, volume, index), update.get(index)
-        sizes = (part.shape[2], part.shape[0] * part.shape[1])
-        correct(stream.queue, sizes, part, change, float(step), *sizes)
-        volume.put(index, part)
+        add_to_slab(stream, volume, index, update.get(index), step)
         stream.queue.finish()
+
+
+def add_to_slab(
+    stream: Stream, volume: Volume, index: int, change: Array, step: float = 1.0
+) -> None:
+    """Do what :func:`add_update` does with one slab, (ny, nx, planes) on the device."""
+    part = writable(stream, volume, index)
+    sizes = (part.shape[2], part.shape[0] * part.shape[1])
+    correct = Step(stream.context, _FILE, "correct", (64, 1))
+    correct(stream.queue, sizes, part, change, float(step), *sizes)
+    volume.put(index, part)
 
 
 class Residual:

@@ -2,10 +2,12 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from pyopencl.array import Array
 
 from clra.model.scan import Scan
+from clra.model.view_selection import runs
 from clra.ops.images.pyramid import Restrict2D
-from clra.ops.streaming.memory import Store
+from clra.ops.streaming.memory import Store, keeps
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float32]
@@ -15,7 +17,8 @@ class Radiographs:
     """The line integrals of a scan, binned, read in chunks.
 
     Binned radiographs are read from the scan once and then kept, on the host or, beyond its budget,
-    in an unnamed temporary file. Full resolution is read where needed.
+    in an unnamed temporary file. Full resolution is read where needed. A device with memory of its
+    own keeps what was uploaded if all of it takes no more than an eighth of the budget.
 
     Parameters
     ----------
@@ -25,12 +28,22 @@ class Radiographs:
         At full resolution.
     level : int
         Binning factor: 1, 2, 4 or 8.
+
+    Attributes
+    ----------
+    extension : float or None
+        How far the sample reaches beyond the detector; None until it is looked at, see
+        :func:`clra.methods.truncation.extension`.
     """
+
+    extension: float | None = None
 
     def __init__(self, stream: Stream, scan: Scan, level: int) -> None:
         self.shape = (scan.views, *scan.geometry.binned(level).shape)
         self.level = level
         self._stream, self._scan = stream, scan
+        self._resident: Array | None = None
+        self._uploaded: NDArray[np.bool_] | None = np.zeros(scan.views, np.bool_)
         self._kept: Store | None = None if level == 1 else self._read_all()
 
     @classmethod
@@ -39,6 +52,7 @@ class Radiographs:
         known = cls.__new__(cls)
         views, rows, columns = kept.shape
         known.shape, known.level, known._kept = (views, rows, columns), level, kept
+        known._uploaded = None  # they may still change
         return known
 
     @property
@@ -51,6 +65,19 @@ class Radiographs:
         if self._kept is None:
             return self._scan.read(views.start, views.stop)
         return self._kept.read(views.start, views.stop)
+
+    def on_device(self, stream: Stream, views: slice) -> Array:
+        """Radiographs `views` on a stream's device; they have to stay as they are."""
+        if self._uploaded is None or not keeps(stream.budgets, self.shape):
+            return stream.upload(self.read(views))
+        if self._resident is None:
+            self._resident = stream.empty(self.shape)
+        for run in runs(~self._uploaded[views]):
+            part = slice(views.start + run.start, views.start + run.stop)
+            stream.fill(self._resident[part], self.read(part))
+            self._uploaded[part] = True
+        array: Array = self._resident[views]
+        return array
 
     def __getitem__(self, views: slice) -> Floats:
         """Radiographs as the projections of a scan."""

@@ -115,7 +115,7 @@ class SlabProjector:
             for slab in slabs
         ]
 
-    _PROJECTOR: type[ForwardProjector] = ForwardProjector
+    _PROJECTOR: type[ForwardProjector | MomentProjector] = ForwardProjector
 
     def __call__(self, projections_out: Array, views: slice) -> cl.Event:
         """Project some views, on the stream's queue.
@@ -129,6 +129,13 @@ class SlabProjector:
         """
         return self._over_slabs((projections_out,), views)
 
+    def _project(
+        self, index: int, outputs: tuple[Array, ...], views: slice, accumulate: bool
+    ) -> cl.Event:
+        """Project a slab."""
+        volume, projector = self._volume.get(index), self._projectors[index]
+        return projector(self._queue, *outputs, volume, views=views, accumulate=accumulate)
+
     def _over_slabs(self, outputs: tuple[Array, ...], views: slice) -> cl.Event:
         """Add up what the slabs give."""
         seen = [
@@ -139,13 +146,7 @@ class SlabProjector:
                 out.fill(0.0, queue=self._queue)
             return cl.enqueue_marker(self._queue)
         for index in seen:
-            event = self._projectors[index].integrals(
-                self._queue,
-                outputs,
-                self._volume.get(index),
-                views=views,
-                accumulate=index != seen[0],
-            )
+            event = self._project(index, outputs, views, index != seen[0])
             if len(seen) > 1:
                 event.wait()  # the slab is let go
         return event

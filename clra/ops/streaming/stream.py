@@ -5,7 +5,6 @@ own arrays: nothing is copied that can be shared.
 """
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -16,6 +15,7 @@ from clra.model.grid import VolumeGrid
 from clra.ops.runtime import build
 from clra.ops.runtime.devices import usable_device
 from clra.ops.streaming.memory import Budgets, DeviceMemory, DeviceMemoryError, HostRoom
+from clra.ops.streaming.staging import Staging
 from clra.progress import Progress, ProgressCallback
 
 Floats = NDArray[np.float32]
@@ -75,6 +75,7 @@ class Stream:
         self._shared = budgets.shared
         # Copies to the device have a queue of their own, to run beside the kernels.
         self._copies = self.queue if self._shared else cl.CommandQueue(self.context)
+        self._staging = Staging(self._copies, budgets.piece)
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Tell the caller how far a stage is."""
@@ -84,18 +85,21 @@ class Stream:
     def upload(self, host: Floats) -> cl.array.Array:
         """Give the device a C-ordered float32 array; a CPU reads it in place.
 
-        What is enqueued on :attr:`queue` afterwards finds it there. The array has to be kept, and
-        left as it is, until the device has done with it.
+        What is enqueued on :attr:`queue` afterwards finds it there. On a CPU the array has to be
+        kept, and left as it is, until the device has done with it.
         """
         if self._shared:
             flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
             shared = cl.Buffer(self.context, flags, hostbuf=host)
             return cl.array.Array(self.queue, host.shape, host.dtype, data=shared)
         array = self.empty(host.shape)
-        buffer: Any = array.base_data
-        copied = cl.enqueue_copy(self._copies, buffer, host, is_blocking=False)
-        cl.enqueue_barrier(self.queue, wait_for=[copied])
+        self.fill(array, host)
         return array
+
+    def fill(self, array: cl.array.Array, host: Floats) -> None:
+        """Copy to an array of a device with memory of its own, as :meth:`upload` does."""
+        if host.size:
+            cl.enqueue_barrier(self.queue, wait_for=[self._staging.copy(array, host)])
 
     def empty(self, shape: tuple[int, ...]) -> cl.array.Array:
         """Device array of float32 with undefined contents."""

@@ -9,7 +9,7 @@ from clra.app.report.comparison import Comparison, MatchedView, Pair
 from clra.app.report.html_report import render, write_report
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
-from clra.methods.alignment.quality import Quality
+from clra.methods.alignment.agreement import Agreement
 from clra.methods.alignment.result import AlignmentResult
 from clra.model.motion import Motion
 
@@ -37,7 +37,7 @@ class Checker(HTMLParser):
         assert self.open.pop() == tag
 
 
-_QUALITY = Quality(2, 0.514, 0.137, 0.083, 0.041, 1.75)
+_QUALITY = Agreement(2, 0.514, 0.137, 0.083, 0.041, 1.75)
 
 
 @pytest.fixture(scope="module")

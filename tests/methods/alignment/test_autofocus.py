@@ -7,11 +7,13 @@ import pytest
 
 import clra
 from clra.app.simulation import paper_like, sample, simulated_motion
-from clra.methods.alignment.autofocus import Focus, autofocus, sharpening_by_turning_back
+from clra.methods.alignment.autofocus import Focus, autofocus
+from clra.methods.alignment.slice_sharpness import sharpening_by_opposite_rotation
 from clra.model.detector_pose import with_detector
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.rotation_sense import opposite_rotation
+from clra.ops.streaming.stream import Stream
 
 OFFSET, TILT = 6.0, math.radians(1.0)
 VIEWS, SHAPE = 90, (64, 64)
@@ -69,9 +71,9 @@ def test_a_focus_out_of_reach_is_said():
 def test_a_sample_that_turns_the_other_way_is_noticed(trajectory):
     scan = _scan(trajectory, jitter=2.0)
     motion = clra.Motion(shift_u=scan.truth.shift_u + OFFSET, shift_v=scan.truth.shift_v)
-    assert sharpening_by_turning_back(scan, motion) < 0.8
+    assert sharpening_by_opposite_rotation(Stream(), scan, motion) < 0.8
     mirrored = clra.Scan(scan.projections, opposite_rotation(scan.geometry))
-    assert sharpening_by_turning_back(mirrored, motion) > 1.2
+    assert sharpening_by_opposite_rotation(Stream(), mirrored, motion) > 1.2
 
 
 def test_a_parallel_beam_does_not_tell_how_the_sample_turns():
@@ -80,4 +82,4 @@ def test_a_parallel_beam_does_not_tell_how_the_sample_turns():
     )
     scan = clra.Scan(sample("porous", far, 1).line_integrals(far), far)
     still = clra.Motion.identity(VIEWS)
-    assert sharpening_by_turning_back(scan, still) == pytest.approx(1.0, abs=0.005)
+    assert sharpening_by_opposite_rotation(Stream(), scan, still) == pytest.approx(1.0, abs=0.005)

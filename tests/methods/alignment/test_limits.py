@@ -64,11 +64,11 @@ def test_what_agrees_is_not_mentioned():
 
 def test_each_note_is_a_warning_and_none_is_no_note():
     with pytest.warns(UserWarning) as said:
-        assert warned("", "one", "", "other") == "one\nother"
+        assert warned(a="", b="one", c="", d="other") == "one\nother"
     assert [str(warning.message) for warning in said] == ["one", "other"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert warned("", "") == ""
+        assert warned(a="", b="") == ""
 
 
 def _grains(geometry, spacing):

@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter
 import clra
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.methods.reconstruction.iterative import Multigrid
 from clra.methods.reconstruction.osem_tr import OrderedSubsets
 from clra.methods.reconstruction.residuals import between, residuals
 from clra.model.gauge.gauge import sample_points, without_gauge
@@ -112,8 +113,10 @@ def test_motion_is_found_on_the_way(aligned):
 
 
 def test_volume_is_as_good_as_with_the_true_motion(scan, truth, aligned, error):
-    without = error(clra.reconstruct(scan, method="imgr", i0=PHOTONS))
-    known = error(clra.reconstruct(scan, method="imgr", motion=truth, i0=PHOTONS))
+    without = error(clra.reconstruct(scan, method="imgr", options=Multigrid(i0=PHOTONS)))
+    known = error(
+        clra.reconstruct(scan, method="imgr", motion=truth, options=Multigrid(i0=PHOTONS))
+    )
     assert error(aligned.volume) < 1.1 * known
     assert known < 0.75 * without
 
@@ -221,12 +224,12 @@ def test_simulated_radiographs_follow_the_motion(rock, geometry, truth, grid, st
 def test_less_memory_than_the_volume_makes_the_same_volume(scan, grid):
     some = scan.subset(slice(None, None, 8))
     size = 4 * int(np.prod(grid.shape))
-    free = clra.reconstruct(some, method="imgr", grid=grid, subsets=3)
+    free = clra.reconstruct(some, method="imgr", grid=grid, options=Multigrid(subsets=3))
     tight = clra.reconstruct(
         some,
         method="imgr",
         grid=grid,
-        subsets=3,
+        options=Multigrid(subsets=3),
         max_device_memory=size // 4,
         max_host_memory=size // 2,
     )

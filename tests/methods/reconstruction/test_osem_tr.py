@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import clra
+from clra.errors import InputError
+from clra.methods.reconstruction.iterative import Multigrid
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import porous
@@ -190,14 +192,16 @@ def test_noise_is_far_below_that_of_filtered_back_projection():
     fbp = clra.reconstruct(scan)
     # From the mean attenuation; the public face adds a margin, which nothing here fills.
     iterative = clra.reconstruct(
-        scan, method="osem-tr", subsets=40, passes=3, initial="uniform", i0=PHOTONS
+        scan,
+        method="osem-tr",
+        options=OrderedSubsets(subsets=40, passes=3, initial="uniform", i0=PHOTONS),
     )
     assert distance(iterative, truth) < 0.75 * distance(fbp, truth)
 
 
 def test_options_of_other_methods_are_refused(integrals):
     scan = clra.Scan(integrals, SMALL)
-    with pytest.raises(ValueError, match=r"subsets: found an option that fbp does not have"):
-        clra.reconstruct(scan, subsets=4)
-    with pytest.raises(ValueError, match=r"levels: found an option that osem-tr does not have"):
-        clra.reconstruct(scan, method="osem-tr", levels="QR-HR-FR")
+    with pytest.raises(InputError, match=r"options: found OrderedSubsets with fbp, expected none"):
+        clra.reconstruct(scan, options=OrderedSubsets(subsets=4))
+    with pytest.raises(InputError, match=r"found Multigrid with osem-tr, expected OrderedSubsets"):
+        clra.reconstruct(scan, method="osem-tr", options=Multigrid(levels="QR-HR-FR"))

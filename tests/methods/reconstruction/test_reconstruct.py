@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 import clra
+from clra.errors import InputError
+from clra.methods.alignment.result import AlignmentResult
+from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
 
 BODY = Ellipsoids([[0, 0, 0], [0.2, 0.1, 0]], [[0.6, 0.6, 0.5], [0.1, 0.2, 0.1]], [1.0, 0.5])
-BELIEVED = np.arange(121) % 40 != 7
+VALID = np.arange(121) % 40 != 7
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +33,28 @@ def scan():
 
 def _spoilt(scan, value):
     pixels = scan.read(0, scan.views).copy()
-    pixels[~BELIEVED] = value
+    pixels[~VALID] = value
     return clra.Scan(pixels, scan.geometry)
 
 
 @pytest.mark.parametrize("method", ["fbp", "osem-tr", "imgr"])
 def test_what_is_not_valid_views_does_not_matter(scan, method):
     volumes = [
-        clra.reconstruct(_spoilt(scan, value), method, valid_views=BELIEVED) for value in (0.0, 9.0)
+        clra.reconstruct(_spoilt(scan, value), method, valid_views=VALID) for value in (0.0, 9.0)
     ]
     assert np.array_equal(*volumes)
-    believing = clra.reconstruct(_spoilt(scan, 9.0), method)
-    assert np.abs(believing - volumes[0]).max() > 0.05
+    trusting = clra.reconstruct(_spoilt(scan, 9.0), method)
+    assert np.abs(trusting - volumes[0]).max() > 0.05
+
+
+def test_views_that_an_alignment_rejected_are_left_out(scan):
+    motion = clra.Motion(shift_u=np.full(121, 0.4), shift_v=np.zeros(121))
+    alignment = AlignmentResult.from_motion(motion, VALID)
+    volume = clra.reconstruct(_spoilt(scan, 9.0), alignment=alignment)
+    expected = clra.reconstruct(_spoilt(scan, 0.0), motion=motion, valid_views=VALID)
+    assert np.array_equal(volume, expected)
+    with pytest.raises(InputError, match="found more than one, expected one of them"):
+        clra.reconstruct(scan, motion=motion, alignment=alignment)
 
 
 @pytest.mark.parametrize("method", ["fbp", "katsevich", "osem-tr", "imgr"])
@@ -53,13 +66,20 @@ def test_what_masked_pixels_hold_does_not_matter(scan, method):
     motion = clra.Motion(shift_u=np.full(121, 0.4), shift_v=np.zeros(121))
     moved = BODY.line_integrals(scan.geometry.with_motion(motion))
 
-    def error(pixels, **more):
-        volume = clra.reconstruct(clra.Scan(pixels, scan.geometry, **more), method, motion=motion)
+    def error(pixels, mask=None, corrections=None):
+        volume = clra.reconstruct(
+            clra.Scan(pixels, scan.geometry, mask=mask),
+            method,
+            motion=motion,
+            corrections=corrections,
+        )
         return np.sqrt(np.mean((volume - truth)[10:-10] ** 2))
 
     spoilt = np.where(mask, moved, 9.0)
     assert error(spoilt, mask=mask) < 1.02 * error(moved)
-    assert error(spoilt) > 1.2 * error(moved)
+    assert error(spoilt, corrections=CorrectionOptions.none()) > 1.2 * error(moved)
+    # Without a mask the bad pixels are found.
+    assert error(spoilt) < 1.02 * error(moved)
 
 
 def test_aligning_on_the_way_finds_them_out(scan):
@@ -72,7 +92,7 @@ def test_katsevich_puts_what_lies_between_in_place_of_them(scan, value):
     whole = clra.reconstruct(scan, "katsevich")
     spoilt = _spoilt(scan, value)  # 9 at the border would be a sample too wide
     with pytest.warns(UserWarning, match="katsevich needs every view: 3 of 121 that are missing"):
-        found = clra.reconstruct(spoilt, "katsevich", valid_views=BELIEVED)
+        found = clra.reconstruct(spoilt, "katsevich", valid_views=VALID)
     used = clra.reconstruct(spoilt, "katsevich")
 
     def rms(volume):
@@ -80,7 +100,7 @@ def test_katsevich_puts_what_lies_between_in_place_of_them(scan, value):
 
     assert rms(found) < 0.05 * rms(used)
     assert rms(found) < 0.001
-    missing = clra.Scan(scan.read(0, scan.views)[BELIEVED], scan.geometry.subset(BELIEVED))
+    missing = clra.Scan(scan.read(0, scan.views)[VALID], scan.geometry.subset(VALID))
     grid = default_grid(scan.geometry)
     with pytest.warns(UserWarning, match="needs every view: 3 of 121"):
         again = clra.reconstruct(missing, "katsevich", grid)

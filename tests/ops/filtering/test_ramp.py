@@ -5,9 +5,11 @@ import pytest
 
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
+from clra.model.sampling.ray_weights import ray_weights, widened
 from clra.model.trajectory import circular
 from clra.ops.filtering import ramp as ramp_module
 from clra.ops.filtering.ramp import RampFilter, taper
+from clra.ops.runtime.profile import CPU, GPU
 
 RELATIVE = 2e-6  # of the largest magnitude: float32 transforms
 ALIASING = 5e-4  # of kernels that go on beyond the padded line
@@ -68,7 +70,9 @@ def filtered(
     distance, reach = geometry.source_to_detector, geometry.source_to_axis
     weighted = image * distance[:, None, None] / ray * row_weight[:, None]
     h = ramp(columns + margin, window)
-    roll = np.cos(np.pi / 2 * np.arange(1, margin + 1) / (margin + 1)) ** 2
+    beyond = np.arange(margin) + 0.5
+    edge, radius = columns / 2, columns / 2 + margin
+    roll = np.sqrt((radius**2 - (edge + beyond) ** 2) / max(radius**2 - edge**2, 1e-9))
     result = np.empty(image.shape)
     for index in np.ndindex(image.shape[:2]):
         line = weighted[index]
@@ -88,8 +92,9 @@ def assert_close(found: np.ndarray, expected: np.ndarray, relative: float = RELA
     np.testing.assert_allclose(found, expected, rtol=0, atol=relative * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("shape", [(5, 13), (1, 64), (7, 37), (3, 1)])
-def test_filter_is_the_direct_convolution(context, queue, shape):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+@pytest.mark.parametrize("shape", [(5, 13), (1, 64), (7, 37), (3, 1), (2, 600)])
+def test_filter_is_the_direct_convolution(context, queue, shape, form):
     geometry = scanner(shape=shape)
     image, row_weight = image_of(geometry), np.linspace(0.5, 1, shape[0])
     view_weight = np.array([1.0, 1.75, 0.5])
@@ -107,10 +112,29 @@ def test_windows_shape_the_ramp(context, queue, window):
     assert_close(found, filtered(geometry, image, np.ones(3), window), ALIASING)
 
 
-def test_extension_continues_truncated_rows(context, queue):
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_filtered_radiographs_of_an_offset_detector_are_wider(context, queue, side, form):
+    """As if the rays past its near side had been measured as 0."""
+    distances = {"source_to_axis": 20.0, "source_to_detector": 60.0, "pixel_size": 1.5}
+    centred = circular(40, shape=(3, 37), **distances)
+    geometry = widened(centred, *((-14, 0) if side > 0 else (0, -14)))
+    rays = ray_weights(geometry)
+    image = image_of(geometry)
+    ramp_filter = RampFilter(context, geometry, ray_weights=rays)
+    assert np.allclose(ramp_filter.geometry.to_astra(), centred.to_astra(), atol=1e-12)
+    out = cl_array.zeros(queue, (40, 3, 37), np.float32)
+    ramp_filter(queue, out, cl_array.to_device(queue, image))
+    beyond = (14, 0) if side > 0 else (0, 14)
+    weighted = np.pad(image * rays.at(np.arange(23))[:, None], ((0, 0), (0, 0), beyond))
+    assert_close(out.get(), filtered(centred, weighted, np.ones(3)), ALIASING)
+
+
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_extension_continues_truncated_rows(context, queue, form):
     geometry = scanner(shape=(3, 40))
     image = image_of(geometry)
-    found = run(context, queue, geometry, image, extend=True)
+    found = run(context, queue, geometry, image, extend=0.2)
     assert_close(found, filtered(geometry, image, np.ones(3), margin=8))
 
 
@@ -122,7 +146,7 @@ def test_extension_flattens_a_truncated_object(context, queue):
     constant = np.ones((1, 1, 99), np.float32)
     sharp, extended = (
         np.abs(run(context, queue, geometry, constant, extend=extend)[0, 0])
-        for extend in (False, True)
+        for extend in (0.0, 0.2)
     )
     assert extended[0] < 0.1 * sharp[0]
     assert extended[49] < sharp[49]
@@ -159,7 +183,8 @@ def test_a_centred_sphere_has_its_attenuation(context, queue):
     np.testing.assert_allclose(found, attenuation, rtol=INTENSITY)
 
 
-def test_any_chunk_gives_the_same(context, queue):
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_any_chunk_gives_the_same(context, queue, form):
     geometry = scanner(views=5)
     image = image_of(geometry)
     expected = run(context, queue, geometry, image)

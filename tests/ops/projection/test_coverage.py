@@ -8,7 +8,10 @@ import pyopencl.array
 import pytest
 
 import clra
-from clra.model.grid import VolumeGrid, field_radii
+from clra.model.grid import VolumeGrid
+from clra.model.sampling.field_of_view import field_radii
+from clra.model.sampling.ray_weights import ray_weights
+from clra.ops.filtering.ramp import taper
 from clra.ops.projection.coverage import Coverage
 
 DETECTOR = {
@@ -89,6 +92,26 @@ def test_views_count_by_their_weight(context, queue):
     volume = _normalised(context, queue, geometry, grid, rows, view_weight=weight)
     expected = _normalised(context, queue, geometry.subset(twice), grid, rows)
     assert np.allclose(volume[expected > 0], expected[expected > 0], rtol=1e-5)
+
+
+def test_with_ray_weights_the_part_on_the_rows_counts(context, queue):
+    geometry = clra.circular(120, arc=math.radians(215), **(DETECTOR | {"shape": (22, 45)}))
+    grid = VolumeGrid(shape=(27, 34, 35), voxel_size=0.4, centre=(0.3, -0.5, 1.0))
+    rays, rows = ray_weights(geometry), taper(geometry.rows, 0.5)
+    x, y, z = grid.coordinates()
+    points = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], axis=-1).reshape(-1, 3)
+    column, row = np.moveaxis(geometry.project(points), 2, 0)
+    beside = (column >= 0) & (column <= geometry.columns - 1)
+    table = rays.at(np.arange(geometry.columns))
+    weight = np.stack([np.interp(c, np.arange(45), t) for c, t in zip(column, table, strict=True)])
+    weight = np.where(beside, weight, 0.0)
+    on = (row >= 0) & (row <= geometry.rows - 1)
+    seen = np.where(on, weight * np.interp(row, np.arange(22), rows), 0.0)
+    expected = (seen.sum(axis=0) / weight.sum(axis=0)).reshape(grid.shape)
+    inverse = _normalised(context, queue, geometry, grid, rows, ray_weights=rays)
+    inside = inverse > 0
+    assert inside.mean() > 0.6
+    assert np.abs(1 / inverse[inside] - expected[inside]).max() < TOLERANCE
 
 
 def test_a_slab_is_part_of_the_whole(context, queue):

@@ -24,7 +24,7 @@ def moments(queue, geometry, grid, volume):
         cl_array.empty(queue, (geometry.views, *geometry.shape), np.float32).fill(np.nan)
         for _ in range(2)
     ]
-    operator.moments(queue, *out, on_device(queue, volume)).wait()
+    operator(queue, *out, on_device(queue, volume)).wait()
     return [one.get() for one in out]
 
 
@@ -54,7 +54,7 @@ def test_moments_of_a_sphere(queue):
     volume = np.clip(0.5 + (radius - distance) / 0.2, 0, 1).astype(np.float32)
     operator = MomentProjector(queue.context, geometry, grid)
     out = [cl_array.empty(queue, (5, *geometry.shape), np.float32) for _ in range(2)]
-    operator.moments(queue, *out, on_device(queue, volume)).wait()
+    operator(queue, *out, on_device(queue, volume)).wait()
     column = np.arange(geometry.columns) - (geometry.columns - 1) / 2
     row = np.arange(geometry.rows) - (geometry.rows - 1) / 2
     source, detector, u, v = (a[:, None, None] for a in np.split(geometry.to_astra(), 4, axis=1))
@@ -85,14 +85,12 @@ def test_first_moment_is_the_forward_projection_and_slabs_add_up(queue):
     ForwardProjector(queue.context, geometry, GRID)(queue, plain, on_device(queue, volume)).wait()
     whole, over = (cl_array.empty_like(plain) for _ in range(2))
     operator = MomentProjector(queue.context, geometry, GRID, scratch_limit=1)
-    operator.moments(queue, whole, over, on_device(queue, volume)).wait()
+    operator(queue, whole, over, on_device(queue, volume)).wait()
     assert np.array_equal(whole.get(), plain.get())
     sums = [cl_array.empty_like(plain) for _ in range(2)]
     for start, stop in ((0, 8), (8, 19)):
         slab = MomentProjector(queue.context, geometry, GRID.slab(start, stop))
-        slab.moments(
-            queue, *sums, on_device(queue, volume[start:stop]), accumulate=start > 0
-        ).wait()
+        slab(queue, *sums, on_device(queue, volume[start:stop]), accumulate=start > 0).wait()
     assert_close(sums[0].get(), whole.get())
     assert_close(sums[1].get(), over.get())
 
@@ -105,8 +103,8 @@ def test_some_views(queue, views):
     volume = on_device(queue, numbers(*GRID.shape))
     operator = MomentProjector(queue.context, geometry, GRID)
     whole = [cl_array.empty(queue, (7, 15, 19), np.float32) for _ in range(2)]
-    operator.moments(queue, *whole, volume).wait()
+    operator(queue, *whole, volume).wait()
     some = [cl_array.empty(queue, (views.stop - views.start, 15, 19), np.float32) for _ in range(2)]
-    operator.moments(queue, *some, volume, views=views).wait()
+    operator(queue, *some, volume, views=views).wait()
     for found, expected in zip(some, whole, strict=True):
         assert np.array_equal(found.get(), expected.get()[views])

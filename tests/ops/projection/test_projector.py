@@ -26,7 +26,7 @@ from projector_cases import (
 
 from clra import ConeBeamGeometry, Motion, VolumeGrid, circular, helix
 from clra.model.phantoms.ellipsoids import Ellipsoids
-from clra.ops.projection import projector
+from clra.ops.projection import cpu_forms
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.runtime.profile import CPU, forced
 
@@ -125,7 +125,10 @@ def test_volumes_of_any_shape(queue, shape, form):
 
 
 @pytest.mark.parametrize(
-    "form", [FORMS["tilted"], NARROW["narrow tilted"]], ids=["", "narrow"], indirect=True
+    "form",
+    [FORMS["tilted"], NARROW["narrow tilted"], FORMS["gpu tilted"]],
+    ids=["", "narrow", "gpu"],
+    indirect=True,
 )
 @pytest.mark.parametrize("pixel", [0.4, 0.9, 1.6])
 @pytest.mark.parametrize("roll, pitch", [(0, 15), (2, 0), (12, -5), (40, 0), (181, 1)])
@@ -139,8 +142,8 @@ def test_detectors_turned_any_way(queue, roll, pitch, pixel, form):
 
 @forms
 def test_lines_of_several_blocks(queue, monkeypatch, form):
-    monkeypatch.setattr(projector, "_LINE", 64)
-    monkeypatch.setattr(projector, "_ADJOINT_LINE", 64)
+    monkeypatch.setattr(cpu_forms, "_LINE", 64)
+    monkeypatch.setattr(cpu_forms, "_ADJOINT_LINE", 64)
     detector = DETECTOR | {"pixel_size": 1.9, "shape": (75, 7)}
     geometry = perturbed(circular(3, start=0.5, **detector), 0.0 if form.columns else 1.0)
     grid = VolumeGrid(shape=(131, 4, 3), voxel_size=0.7)

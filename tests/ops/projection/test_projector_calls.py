@@ -21,7 +21,7 @@ from projector_cases import (
 )
 
 from clra import VolumeGrid, circular
-from clra.ops.projection import layout, projector
+from clra.ops.projection import cpu_forms, gpu_forms, layout
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.runtime.profile import forced
 
@@ -53,13 +53,30 @@ def test_a_view_that_misses_the_volume_gives_nothing(queue, form):
     assert not back(queue, geometry, grid, projections, matched=True).any()
 
 
+@pytest.mark.parametrize("name", ["helix", "space-filling", "v down", "tilted"])
+def test_heights_are_what_a_view_sees(queue, name):
+    """No voxel beyond them gets anything; of axial views those at the ends do."""
+    geometry = GEOMETRIES[name]
+    ones = on_device(queue, np.ones((1, *geometry.shape)))
+    for view, (bottom, top) in enumerate(layout.heights(geometry, GRID)):
+        volume = cl_array.empty(queue, GRID.shape, np.float32)
+        one = geometry.subset(slice(view, view + 1))
+        BackProjector(queue.context, one, GRID)(queue, volume, ones).wait()
+        seen = np.flatnonzero(volume.get().any(axis=(1, 2)))
+        assert not len(seen) or (bottom <= seen[0] and seen[-1] < top)
+        if geometry.axial:
+            assert len(seen) >= top - bottom - 3
+
+
 @pytest.mark.parametrize("small", [False, True], ids=["at once", "in parts"])
 @forms
 def test_views_may_come_in_chunks(queue, monkeypatch, request, form, small):
     if small:  # scratch for two views, parts of two planes
         monkeypatch.setattr(layout, "_LEAST_VIEWS", 2)
-        monkeypatch.setattr(projector, "_PART_BYTES", 0)
-        monkeypatch.setattr(projector, "_LEAST_PLANES", 2)
+        monkeypatch.setattr(cpu_forms, "_PART_BYTES", 0)
+        monkeypatch.setattr(gpu_forms, "_RUN", 2)
+        monkeypatch.setattr(gpu_forms, "_MOST_WORK", 5 * np.prod(GRID.shape))
+        monkeypatch.setattr(cpu_forms, "_LEAST_PLANES", 2)
         tight = forced(replace(form, projector_bytes=0))
         tight.__enter__()
         request.addfinalizer(lambda: tight.__exit__(None, None, None))

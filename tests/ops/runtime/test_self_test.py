@@ -29,7 +29,7 @@ def only(monkeypatch):
     """One device, which no narrower CPU name helps."""
     device = devices.choose_device()
     monkeypatch.setattr(devices, "_all_devices", lambda: [("0:0", device)])
-    monkeypatch.setattr(pocl, "needs_pairing", lambda device: False)
+    monkeypatch.setattr(pocl, "covered", lambda cpus, flags: [])
     return device
 
 
@@ -106,6 +106,7 @@ def test_a_failure_is_kept_unless_it_was_only_slow(monkeypatch, only, program, t
 
 
 def test_a_narrower_cpu_is_tried_and_taken_from_then_on(monkeypatch, only):
+    monkeypatch.setattr(pocl, "covered", COVERED)
     monkeypatch.setattr(pocl, "needs_pairing", lambda device: True)
     monkeypatch.setattr(pocl, "cpu_flags", lambda: frozenset(VARIANT_OF_HASWELL | {"avx512f"}))
     asked = replace_trials(monkeypatch, [ABORTS, WRONG, RIGHT])
@@ -118,6 +119,7 @@ def test_a_narrower_cpu_is_tried_and_taken_from_then_on(monkeypatch, only):
     assert pocl._preferred == "x86-64" and len(asked) == 3
 
 
+COVERED = pocl.covered
 VARIANT_OF_HASWELL = {"sse2"} | next(flags for _, cpu, flags in pocl.VARIANTS if cpu == "haswell")
 
 

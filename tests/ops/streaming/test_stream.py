@@ -88,6 +88,35 @@ def test_full_resolution_is_read_where_needed():
     assert Counting.read == 1
 
 
+def test_what_is_uploaded_may_change_at_once():
+    """Through a ring of three buffers, in pieces, of which the last is no whole one."""
+    with forced(replace(CPU, shared_memory=False)):
+        stream = Stream(max_host_memory=1 << 20)
+    host = np.arange(5 * stream.budgets.piece // 4 + 3, dtype=np.float32)
+    arrays = []
+    for _ in range(3):
+        arrays.append(stream.upload(host))
+        host += 1
+    for added, array in enumerate(arrays):
+        expected = np.arange(host.size, dtype=np.float32) + added
+        assert np.array_equal(stream.download(array), expected)
+
+
+def test_radiographs_stay_on_a_device_with_its_own_memory():
+    pixels = np.random.default_rng(3).random((7, 12, 16), np.float32)
+    scan = clra.Scan(pixels, clra.circular(7, shape=(12, 16), **DETECTOR))
+    with forced(replace(CPU, shared_memory=False)):
+        stream = Stream()
+    radiographs = Radiographs(stream, scan, 1)
+    for views in slice(2, 5), slice(0, 4), slice(1, 7):
+        assert np.array_equal(stream.download(radiographs.on_device(stream, views)), pixels[views])
+    taken = stream.memory.taken
+    assert taken == pixels.nbytes
+    pixels[:] = 0  # nothing is read again
+    assert stream.download(radiographs.on_device(stream, slice(0, 7))).all()
+    assert stream.memory.taken == taken
+
+
 @pytest.mark.parametrize("budget", [None, 40 << 10])
 def test_a_device_with_its_own_memory_gets_copies(budget):
     """As on a GPU: radiographs are copied on a queue beside the one that works on them."""

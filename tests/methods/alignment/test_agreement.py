@@ -5,7 +5,7 @@ import pytest
 
 import clra
 from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
-from clra.methods.alignment.quality import quality
+from clra.methods.alignment.agreement import agreement
 from clra.ops.streaming.stream import Stream
 
 VIEWS, SHAPE = 120, (96, 96)
@@ -28,7 +28,7 @@ def test_the_true_motion_is_told_from_none_and_from_a_worse_one(moved):
         shift_v=truth.shift_v + random.normal(0, 0.5, VIEWS),
         magnification=truth.magnification,
     )
-    good, bad = (quality(Stream(), moved, motion, 1) for motion in (truth, worse))
+    good, bad = (agreement(Stream(), moved, motion, 1) for motion in (truth, worse))
     assert good.level == 1
     assert good.unexplained_before == pytest.approx(bad.unexplained_before)
     assert good.unexplained_after < 0.5 * good.unexplained_before
@@ -38,13 +38,13 @@ def test_the_true_motion_is_told_from_none_and_from_a_worse_one(moved):
 
 
 def test_without_motion_nothing_changes(moved):
-    none = quality(Stream(), moved, clra.Motion.identity(VIEWS), 2)
+    none = agreement(Stream(), moved, clra.Motion.identity(VIEWS), 2)
     assert none.unexplained_after == pytest.approx(none.unexplained_before)
     assert none.sharpness == pytest.approx(1)
 
 
 def test_every_second_view_may_be_bad(moved):
     valid_views = np.arange(VIEWS) % 2 == 0
-    found = quality(Stream(), moved, moved.truth, 2, valid_views)
-    whole = quality(Stream(), moved, moved.truth, 2)
+    found = agreement(Stream(), moved, moved.truth, 2, valid_views)
+    whole = agreement(Stream(), moved, moved.truth, 2)
     assert 0 < found.half_u < 4 * whole.half_u

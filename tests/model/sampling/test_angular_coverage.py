@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 import clra
-from clra.model.angular_coverage import angle_weights, part_of_a_turn
+from clra.model.sampling.angular_coverage import (
+    angle_weights,
+    holes,
+    is_whole_circle,
+    part_of_a_turn,
+)
 from clra.model.trajectory import circular, helix
 
 DETECTOR = {
@@ -59,14 +64,14 @@ def test_what_is_seen_in_two_turns_weighs_half_in_each():
     ("geometry", "covered"),
     [
         (
-            circular(180, arc=math.radians(207), **DETECTOR),
-            "207 degrees of the circle, expected 360",
+            circular(180, arc=math.radians(195), **DETECTOR),
+            "195 degrees of the circle",
         ),
         (circular(180, arc=math.pi, **DETECTOR), "180 degrees"),
-        (
-            circular(180, arc=1.5 * math.pi, **PARALLEL),
-            "270 degrees of the circle, expected 180 or",
-        ),
+        (circular(180, arc=0.9 * math.pi, **PARALLEL), "162 degrees of the circle, expected at"),
+        # The full fan is 2 atan(0.24) = 27 degrees wide.
+        (circular(180, arc=math.radians(208), **DETECTOR), ""),
+        (circular(180, arc=1.5 * math.pi, **PARALLEL), ""),
         (circular(180, **DETECTOR), ""),
         (circular(270, arc=3 * math.pi, **DETECTOR), ""),
         (circular(180, arc=math.pi, **PARALLEL), ""),
@@ -75,6 +80,24 @@ def test_what_is_seen_in_two_turns_weighs_half_in_each():
         (helix(50, angle_step=0.05, z_step=0.1, **DETECTOR), ""),
     ],
 )
-def test_a_part_of_a_turn_is_said(geometry, covered):
-    said = part_of_a_turn(geometry)
-    assert covered in said and bool(said) == bool(covered)
+def test_an_arc_that_does_not_measure_all_rays_is_warned_of(geometry, covered):
+    warned = part_of_a_turn(geometry)
+    assert covered in warned and bool(warned) == bool(covered)
+
+
+def test_holes_begin_half_a_step_after_the_last_view():
+    missing = holes(circular(90, arc=1.5 * math.pi, start=0.5, **DETECTOR))
+    step = math.pi / 60
+    assert missing == pytest.approx(np.array([[0.5 + 1.5 * math.pi - step / 2, 0.5 * math.pi]]))
+
+
+@pytest.mark.parametrize(
+    ("geometry", "whole"),
+    [
+        (circular(90, **DETECTOR), True),
+        (circular(90, arc=math.radians(300), **DETECTOR), False),
+        (helix(90, angle_step=0.2, z_step=0.1, **DETECTOR), False),
+    ],
+)
+def test_whole_circles(geometry, whole):
+    assert is_whole_circle(geometry) == whole

@@ -41,7 +41,7 @@ def angle_weights(geometry: ConeBeamGeometry) -> Floats:
         of the turn only.
     """
     weights = np.ones(geometry.views)
-    if geometry.views < 2 or not _is_circle(geometry):
+    if geometry.views < 2 or not is_circle(geometry):
         return weights
     order, gaps, step = _gaps(geometry)
     gaps = np.where(_hole(gaps, step), step, gaps)
@@ -67,7 +67,7 @@ def covered(geometry: ConeBeamGeometry) -> float:
 
 
 def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
-    """Return a warning if redundant rays of a short scan are counted twice.
+    """Return a warning if the views of an arc do not measure all rays.
 
     Parameters
     ----------
@@ -77,25 +77,50 @@ def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
     Returns
     -------
     str
-        Empty if all is well: no circle, a whole turn, or half a turn of a parallel beam.
+        Empty if all is well: no circle, a whole one, or at least half of one and the fan.
     """
     angle = covered(geometry)
-    if geometry.views < 2 or angle == 2 * math.pi or not _is_circle(geometry):
+    if geometry.views < 2 or angle == 2 * math.pi or not is_circle(geometry):
         return ""
     width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
-    parallel = 0.5 * float(np.median(width)) < _PARALLEL
-    step = angle / geometry.views
-    if parallel and abs(angle - math.pi) < 2 * step:
+    half_fan = math.atan(0.5 * float(np.median(width)))
+    needed = math.pi + (2 * half_fan if half_fan > _PARALLEL else 0.0)
+    if angle > needed - 2 * angle / geometry.views:
         return ""
     return (
-        f"fbp counts rays that are seen from both sides twice: views cover "
-        f"{math.degrees(angle):.0f} degrees of the circle, expected "
-        f"{'180 or ' if parallel else ''}360; intensities may be off by a fifth, less by method "
-        "'osem-tr' or 'imgr'"
+        f"views cover {math.degrees(angle):.0f} degrees of the circle, expected at least "
+        f"{math.degrees(needed):.0f} to measure all rays: intensities by method 'fbp' may be off, "
+        "less by method 'osem-tr' or 'imgr'"
     )
 
 
-def _is_circle(geometry: ConeBeamGeometry) -> bool:
+def holes(geometry: ConeBeamGeometry) -> Floats:
+    """Return where a turn has no views.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of any trajectory.
+
+    Returns
+    -------
+    ndarray, (holes, 2)
+        Angle at which each begins, half a step past the last view, and its width [rad]; at angle b
+        the source is at (sin b, -cos b).
+    """
+    order, gaps, step = _gaps(geometry)
+    here = np.flatnonzero(_hole(gaps, step))
+    starts = _angles(geometry)[order[here]] + 0.5 * step
+    return np.stack([starts, gaps[here] - step], axis=1)
+
+
+def is_whole_circle(geometry: ConeBeamGeometry) -> bool:
+    """Whether the sources stand all around a circle."""
+    return geometry.views > 1 and is_circle(geometry) and covered(geometry) == 2 * math.pi
+
+
+def is_circle(geometry: ConeBeamGeometry) -> bool:
+    """Whether the sources stand on a circle or an arc, rather than on a helix."""
     height = geometry.rows * np.linalg.norm(geometry.v, axis=1)
     at_axis = np.abs(geometry.source_to_axis / geometry.source_to_detector) * height
     return bool(np.ptp(geometry.source[:, 2]) <= _FLAT * np.median(at_axis))
@@ -103,10 +128,14 @@ def _is_circle(geometry: ConeBeamGeometry) -> bool:
 
 def _gaps(geometry: ConeBeamGeometry) -> tuple[NDArray[np.intp], Floats, float]:
     """Sort views by angle; also the gap from each to the next, and how wide gaps are."""
-    angle = np.arctan2(geometry.source[:, 0], -geometry.source[:, 1]) % (2 * np.pi)
+    angle = _angles(geometry)
     order = np.argsort(angle, kind="stable")
     gaps = np.diff(angle[order], append=angle[order[0]] + 2 * np.pi)
     return order, gaps, float(np.quantile(gaps, _NEARLY_ALL, method="lower"))
+
+
+def _angles(geometry: ConeBeamGeometry) -> Floats:
+    return np.arctan2(geometry.source[:, 0], -geometry.source[:, 1]) % (2 * np.pi)
 
 
 def _hole(gaps: Floats, step: float) -> NDArray[np.bool_]:

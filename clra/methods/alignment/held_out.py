@@ -1,0 +1,180 @@
+"""Held-out views: how well a volume from some of the views predicts the others.
+
+A volume can be made to agree with radiographs that lie wrong, as long as it is made from them.
+Views that it was not made from are predicted well only if all lie where they belong. The volume is
+not negative and found by iteration: ramp-filtered back-projection is a poor inverse where rays are
+missing, and its artefacts would hide the difference.
+"""
+
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.alignment.reprojection import (
+    registration_for,
+    reproject_and_register,
+    with_margin,
+)
+from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
+from clra.model.grid import default_grid
+from clra.model.motion import Motion
+from clra.model.scan import Scan
+from clra.model.subsets import ordered_subsets
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+
+Floats = NDArray[np.float64]
+
+# Updates of the volume, all subsets of all passes. At half of it the residual of a perfect motion
+# is a fifth larger, at twice a tenth smaller.
+_UPDATES = 12
+# Parts of the views, each predicted from the others: of few views a half is too few to go by.
+_FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
+# Photons that weigh the rays against each other: nearly alike.
+_PHOTONS = 1e3
+# Columns and views of what is looked at, at most: a few seconds whatever the size of the scan.
+_COLUMNS, _VIEWS = 80, 720
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What held-out views say of a motion; one value a view, NaN for views not held out.
+
+    Attributes
+    ----------
+    residual : ndarray, (views,)
+        RMS of what the prediction leaves of a radiograph where it lies, in the band of
+        registration, as a part of the radiograph's own.
+    shift : ndarray, (views, 3)
+        What registration with the prediction finds to be left: shift_u, shift_v [pixel of the
+        full-resolution detector] and log(magnification); 0 where it is not registered.
+    sharpness : float
+        Mean squared gradient of the volumes.
+    """
+
+    residual: Floats
+    shift: Floats
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Predictions of one scan's radiographs at a low resolution.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        At full resolution.
+    """
+
+    stream: Stream
+    scan: Scan
+
+    @property
+    def level(self) -> int:
+        """Binning factor."""
+        rows, columns = self.scan.geometry.shape
+        level = 1
+        while columns > _COLUMNS * level and min(rows, columns) >= 32 * level:
+            level *= 2
+        return level
+
+    def chosen(self, valid_views: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the valid views that are looked at: all, or some evenly spread runs of two."""
+        valid = np.flatnonzero(valid_views)
+        if len(valid) <= _VIEWS:
+            return valid
+        spread = np.unique(np.linspace(0, len(valid) - 1, _VIEWS).astype(int))
+        return np.asarray(valid[spread])
+
+    def radiographs(self, valid_views: NDArray[np.bool_]) -> tuple[Radiographs, NDArray[np.intp]]:
+        """Read and bin what is needed; the second value are the views that these are."""
+        views = self.chosen(valid_views)
+        return Radiographs(self.stream, self.scan.subset(views), self.level), views
+
+    def predict(
+        self,
+        radiographs: Radiographs,
+        views: NDArray[np.intp],
+        motion: Motion,
+        *,
+        magnification: bool,
+        whole: bool,
+        stage: str,
+    ) -> Predicted:
+        """Predict views from others, and compare.
+
+        Parameters
+        ----------
+        radiographs : Radiographs
+            As :meth:`radiographs` reads them.
+        views : ndarray of int
+            Of the scan that they are.
+        motion : Motion
+            Of all views of the scan [pixel of the full-resolution detector].
+        magnification : bool
+            Whether to register it.
+        whole : bool
+            Whether each of the views is held out once, or one part of them only.
+        stage : str
+            What progress reports begin with.
+        """
+        level, scan = self.level, self.scan.subset(views)
+        full = with_margin(default_grid(scan.geometry))
+        grid = full.binned(level) if level > 1 else full
+        geometry = scan.geometry.with_motion(motion.subset(views)).binned(level)
+        binned = Scan(radiographs, geometry)
+        index = np.arange(len(views))
+        parts = _PARTS_OF_FEW if len(views) < _FEW else _PARTS
+        residual = np.full(self.scan.views, np.nan)
+        shift = np.full((self.scan.views, 3), np.nan)
+        sharpness = []
+        for part in range(parts if whole else 1):
+            held, train = index[part::parts], np.delete(index, np.s_[part::parts])
+            seen, around = Radiographs(self.stream, binned.subset(train), 1), geometry.subset(train)
+            count = len(ordered_subsets(around, grid))
+            options = OrderedSubsets(passes=ceil(_UPDATES / count), i0=_PHOTONS)
+            volume = start_volume(self.stream, seen, around, grid, options)
+            used = np.ones(geometry.shape, np.bool_)
+            title = f"{stage}: volume {part + 1}"
+            osem_tr(self.stream, seen, around, volume, options, used=used, stage=title)
+            hidden = Radiographs(self.stream, binned.subset(held), 1)
+            still, moved = (
+                reproject_and_register(
+                    self.stream,
+                    hidden,
+                    volume,
+                    geometry.subset(held),
+                    registration_for(
+                        self.stream,
+                        scan,
+                        radiographs,
+                        first=False,
+                        magnification=magnification,
+                        still=where_it_lies,
+                    ),
+                    magnification=np.ones(len(held)),
+                    detector=geometry.shape,
+                    stage=f"{stage}: comparing",
+                )
+                for where_it_lies in (True, False)
+            )
+            residual[views[held]] = np.sqrt(1 - np.clip(still.correlation, 0, 1) ** 2)
+            found = moved.motion
+            shift[views[held]] = np.stack(
+                [level * found.shift_u, level * found.shift_v, np.log(found.magnification)], axis=1
+            )
+            sharpness.append(_gradient(volume.to_host()))
+        return Predicted(residual, shift, float(np.mean(sharpness)))
+
+
+def _gradient(volume: NDArray[np.float32]) -> float:
+    """Mean squared gradient of the middle half of the planes."""
+    quarter = len(volume) // 4
+    middle = volume[quarter : len(volume) - quarter].astype(np.float64)
+    slopes = np.gradient(middle, axis=(1, 2))
+    return float(np.mean(slopes[0] ** 2 + slopes[1] ** 2))

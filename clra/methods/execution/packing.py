@@ -1,0 +1,51 @@
+"""Values of an alignment as plain values and arrays, for checkpoints."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.alignment.reprojection import Registered
+from clra.methods.alignment.result import Iteration
+from clra.model.motion import Motion
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def motion_arrays(name: str, motion: Motion) -> dict[str, NDArray[Any]]:
+    """Return a motion as one array (3, views), its cause apart."""
+    return {name: np.stack([motion.shift_u, motion.shift_v, motion.magnification])}
+
+
+def motion_from(arrays: Arrays, name: str, cause: str) -> Motion:
+    """Return the motion that :func:`motion_arrays` packed."""
+    u, v, magnification = arrays[name]
+    return Motion(shift_u=u, shift_v=v, magnification=magnification, cause=cause)
+
+
+def registered_arrays(found: Registered | None) -> dict[str, NDArray[Any]]:
+    """Return the columns of a registration, if there is one."""
+    if found is None:
+        return {}
+    columns = {f"registered_{n}": getattr(found, n) for n in ("correlation", "residual", "sigma")}
+    return motion_arrays("registered", found.motion) | columns
+
+
+def registered_from(arrays: Arrays) -> Registered | None:
+    """Return the registration that :func:`registered_arrays` packed."""
+    if "registered" not in arrays:
+        return None
+    columns = {n: arrays[f"registered_{n}"] for n in ("correlation", "residual", "sigma")}
+    return Registered(motion_from(arrays, "registered", "detector"), **columns)
+
+
+def history_values(history: tuple[Iteration, ...] | list[Iteration]) -> list[dict[str, Any]]:
+    """Return the iterations as plain values."""
+    return [asdict(iteration) for iteration in history]
+
+
+def history_from(values: list[dict[str, Any]]) -> list[Iteration]:
+    """Return the iterations that :func:`history_values` packed."""
+    return [Iteration(**value) for value in values]

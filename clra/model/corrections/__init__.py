@@ -1,0 +1,1 @@
+"""Corrections of radiographs: what the detector and the beam did to them."""
