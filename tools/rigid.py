@@ -26,10 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import clra
-from clra.model.gauge.rigid_gauge import between
 from clra.model.phantoms.ellipsoids import Ellipsoids
 from clra.model.phantoms.perturbation import smooth_motion
-from clra.model.rigid_motion import RigidMotion, rotation_matrices, rotation_vectors, view_axes
+from clra.model.rigid.rigid_gauge import between
+from clra.model.rigid.rigid_motion import (
+    RigidMotion,
+    rotation_matrices,
+    rotation_vectors,
+    view_axes,
+)
 
 Floats = NDArray[np.float64]
 
@@ -109,10 +114,10 @@ def true_motion(case: Case, seed: int) -> RigidMotion:
     if case.wobble:
         size[[3, 5]] = np.radians(case.wobble)
     if not case.smooth:
-        return RigidMotion.from_table(size * random.uniform(-1, 1, (case.views, 6)))
+        return RigidMotion.of(nominal(case), size * random.uniform(-1, 1, (case.views, 6)))
     curves = [smooth_motion(case.views, shift=(-1.0, 1.0), seed=seed + k) for k in range(3)]
     unit = np.stack([c for one in curves for c in (one.shift_u, one.shift_v)], axis=1)
-    return RigidMotion.from_table(size * unit)
+    return RigidMotion.of(nominal(case), size * unit)
 
 
 def simulated(case: Case, seed: int) -> tuple[clra.Scan, clra.ConeBeamGeometry, Ellipsoids]:
@@ -152,13 +157,15 @@ def score(
         error = (image(moved) - seen)[inside].ravel()
         moved -= np.linalg.lstsq(np.stack(columns, axis=1), error, rcond=1e-10)[0]
     apart = np.where(inside[..., None], image(moved) - seen, np.nan)
-    u, v = np.nanmean(np.abs(np.nanmean(apart, axis=1)), axis=0)
+    shifts = np.nanmean(apart, axis=1)
+    u, v = np.nanmean(np.abs(shifts), axis=0)
     turn = rotation_matrices(moved[None, 3:6])[0]
     axes = np.swapaxes(view_axes(true), 1, 2) @ (turn.T @ view_axes(estimate))
     rotations = np.degrees(rotation_vectors(axes))
     return {
         "u": float(u),
         "v": float(v),
+        "shifts": shifts.std(axis=0).tolist(),
         "rotations": rotations.std(axis=0).tolist(),
         "norm": float(np.sqrt(np.mean(np.sum(rotations**2, axis=1)))),
     }
@@ -174,15 +181,16 @@ def measured(case: Case, seed: int) -> dict[str, Any]:
     rigid = clra.align(scan, estimate="rigid", grid=grid)
     seconds = time.perf_counter() - started
     found = scan.geometry.with_motion(rigid.motion)
-    # Standard deviations over the views, as the errors are; of the errors what is no common turn.
-    wrong = between(true, found).table
-    spread = (wrong - wrong.mean(axis=0)).std(axis=0)
+    errors = score(found, true, phantom)
+    size = between(true, found).magnification.std()
+    spread = [*errors["shifts"], size, *np.radians(errors["rotations"])]
     sigma = np.sqrt(np.nanmean(rigid.sigma**2, axis=0))
+    ratio = np.array(spread[: len(sigma)]) / sigma
     return {
         "before": score(scan.geometry, true, phantom),
         "shifts": score(scan.geometry.with_motion(shifts.motion), true, phantom),
-        "rigid": score(found, true, phantom),
-        "error over sigma": (spread / sigma).tolist(),
+        "rigid": errors,
+        "error over sigma": ratio.tolist(),
         "seconds": seconds,
     }
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
-from clra.model.rigid_motion import RigidMotion, absorb
+from clra.model.rigid.rigid_motion import RigidMotion, absorb
 from clra.model.validation import detector_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class ConeBeamGeometry:
     def _centre(self) -> Floats:
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
-    def with_motion(self, motion: Motion | RigidMotion) -> ConeBeamGeometry:
+    def with_motion(self, motion: Motion) -> ConeBeamGeometry:
         """Absorb the motion of each view, so that no radiograph is resampled.
 
         A point that this geometry puts at pixel q, the returned one puts at
@@ -167,14 +167,13 @@ class ConeBeamGeometry:
 
         Parameters
         ----------
-        motion : Motion or RigidMotion
+        motion : Motion
             In pixels of this geometry's detector: absorb first, bin after.
 
         Returns
         -------
         ConeBeamGeometry
-            With u / m, v / m and detector - (shift_u u + shift_v v) / m; or with the source, or all
-            four vectors, moved.
+            With u / m, v / m and detector - (shift_u u + shift_v v) / m, or with the source moved.
 
         Raises
         ------
@@ -187,9 +186,7 @@ class ConeBeamGeometry:
             raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
             source = self.source + self.source_displacement(motion)
-            return ConeBeamGeometry(
-                source=source, detector=self.detector, u=self.u, v=self.v, shape=self.shape
-            )
+            return replace(self, source=source)
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]
         detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v
@@ -259,13 +256,8 @@ class ConeBeamGeometry:
             Which views, in that order.
         """
         chosen = selection(index)
-        return ConeBeamGeometry(
-            source=self.source[chosen],
-            detector=self.detector[chosen],
-            u=self.u[chosen],
-            v=self.v[chosen],
-            shape=self.shape,
-        )
+        names = ("source", "detector", "u", "v")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def projection_matrices(self) -> Floats:
         """Return the matrices that project points to pixels.

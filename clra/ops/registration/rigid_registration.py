@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.rigid_motion import turning_axes, view_axes
+from clra.model.rigid.rigid_motion import turning_axes, view_axes
 from clra.ops.images.bandpass import Bandpass
 from clra.ops.registration.windows import registration_window
 from clra.ops.runtime.buffers import (
@@ -35,7 +35,7 @@ class RigidRegistration:
     r"""Which rigid motion of the sample brings simulated radiographs closer to measured ones.
 
     With the derivatives :math:`J_k` of the simulated radiograph p by the six parameters of
-    :class:`~clra.model.rigid_motion.RigidMotion`, the band-pass D and weights W, the normal
+    :class:`~clra.model.rigid.rigid_motion.RigidMotion`, the band-pass D and weights W, the normal
     equations of
 
     .. math:: \sum_q W(q) \left[ D(m - p) - \sum_k x_k D J_k - g D p \right]^2(q)

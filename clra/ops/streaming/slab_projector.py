@@ -103,7 +103,7 @@ class SlabProjector:
         scratch = Reused(stream.memory)
         slabs = volume.slabs
         self._seeing = [views_that_see(geometry, slab) for slab in slabs]
-        self._projectors = [
+        self._projectors: list[Any] = [
             self._PROJECTOR(
                 stream.context,
                 geometry,
@@ -134,7 +134,10 @@ class SlabProjector:
     ) -> cl.Event:
         """Project a slab."""
         volume, projector = self._volume.get(index), self._projectors[index]
-        return projector(self._queue, *outputs, volume, views=views, accumulate=accumulate)
+        event: cl.Event = projector(
+            self._queue, *outputs, volume, views=views, accumulate=accumulate
+        )
+        return event
 
     def _over_slabs(self, outputs: tuple[Array, ...], views: slice) -> cl.Event:
         """Add up what the slabs give."""

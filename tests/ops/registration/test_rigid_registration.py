@@ -8,7 +8,7 @@ from projector_cases import off_centre, perturbed
 
 from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.rigid_motion import RigidMotion
+from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.trajectory import circular, helix
 from clra.ops.images.bandpass import Bandpass
 from clra.ops.registration.rigid_registration import PRODUCTS, RigidRegistration, rigid_table
@@ -90,7 +90,7 @@ def test_derivatives_against_finite_differences_of_closed_forms(queue, geometry)
         table = np.zeros((geometry.views, 6))
         table[:, k] = step
         ahead, behind = (
-            integrals(geometry.with_motion(RigidMotion.from_table(sign * table)), samples=3)[0]
+            integrals(geometry.with_motion(RigidMotion.of(geometry, sign * table)), samples=3)[0]
             for sign in (1, -1)
         )
         expected = (ahead - behind) / (2 * step)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.rejected_views import outliers
 from clra.methods.alignment.result import AlignmentResult, Iteration
-from clra.methods.alignment.rigid_level import RigidLevel
-from clra.methods.alignment.rigid_solution import RigidStep
+from clra.methods.alignment.rigid.rigid_level import RigidLevel
+from clra.methods.alignment.rigid.rigid_solution import RigidStep
 from clra.model.gauge.gauge import sample_points
-from clra.model.gauge.rigid_gauge import without_rigid_gauge
 from clra.model.grid import VolumeGrid
-from clra.model.rigid_motion import RigidMotion
+from clra.model.rigid.rigid_gauge import without_rigid_gauge
+from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 from clra.model.schedule import level_name
 from clra.ops.streaming.stream import Stream
@@ -32,7 +32,7 @@ FREE = {
     "shift+roll": (0, 1, 5),
     "shift+scale+roll": (0, 1, 2, 5),
 }
-"""Parameters of `clra.model.rigid_motion.PARAMETERS` that each kind of estimate frees."""
+"""Parameters of `clra.model.rigid.rigid_motion.PARAMETERS` that each kind of estimate frees."""
 
 # Expected standard deviation of a step along the beam [voxel at full resolution] and of rotations
 # [rad]; shifts are not held. A step along the beam is seen 50 times less well than one across it.
@@ -115,16 +115,18 @@ class RigidAlignment:
             self.rejected |= outliers(step.correlation)
             table = self._interpolated(table)
             before = self.motion
-            self.motion = self.motion.then(RigidMotion.from_table(table))
+            self.motion = self.motion.then(self.motion.with_table(table))
             if self.anchor:
                 self.motion = without_rigid_gauge(self.motion, self.scan.geometry, self.points)
             self.last = step
-            moved = self.motion.in_pixels(self.scan.geometry) - before.in_pixels(self.scan.geometry)
+            moved = np.stack(
+                [self.motion.shift_u - before.shift_u, self.motion.shift_v - before.shift_v]
+            )
             self.history.append(
                 Iteration.of(
                     name,
                     iteration,
-                    moved[:, :2].T,
+                    moved,
                     step.correlation,
                     step.residual,
                     time.perf_counter() - started,
@@ -147,9 +149,17 @@ class RigidAlignment:
             motion=self.motion,
             valid_views=valid,
             confidence=np.clip(np.where(valid, self.last.correlation, 0.0), 0.0, 1.0),
-            sigma=self.last.sigma,
+            sigma=self._sigma(),
             history=tuple(self.history),
             gauge=self.start.gauge,
             schedule=self.start.schedule,
             device=self.start.device,
         )
+
+    def _sigma(self) -> Floats:
+        """Return standard errors of shifts [pixel], magnification and rotations [rad]."""
+        near, per_u, per_v = self.motion.optics[:, :3].T
+        sigma = self.last.sigma.copy()
+        for column, factor in enumerate((per_u / near, per_v / near, 1 / near)):
+            sigma[:, column] *= factor
+        return sigma

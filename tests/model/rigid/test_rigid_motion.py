@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from clra.errors import InputError
 from clra.model.motion import Motion
-from clra.model.rigid_motion import (
+from clra.model.rigid.rigid_motion import (
     RigidMotion,
     rotation_matrices,
     rotation_vectors,
@@ -29,8 +29,8 @@ def geometry(views=7):
 
 def random_motion(views=7, seed=0):
     random = np.random.default_rng(seed)
-    return RigidMotion(
-        translation=random.normal(size=(views, 3)), rotation=0.1 * random.normal(size=(views, 3))
+    return RigidMotion.of(
+        geometry(views), random.normal(size=(views, 6)) * [1, 1, 1, 0.1, 0.1, 0.1]
     )
 
 
@@ -88,8 +88,10 @@ def test_translations_of_shifts_show_the_shifts_at_the_axis(aside):
     by_shift = of.with_motion(shifts).project(points)
     by_translation = of.with_motion(rigid).project(points)
     assert np.allclose(by_shift, by_translation, atol=1e-9)
-    assert np.allclose(rigid.in_pixels(of)[:, 0], shifts.shift_u)
-    assert np.allclose(rigid.in_pixels(of)[:, 2], shifts.magnification - 1)
+    for name in ("shift_u", "shift_v", "magnification"):
+        assert np.allclose(getattr(rigid, name), getattr(shifts, name))
+    moved_centre = shifts.about(3.0, -2.0)
+    assert np.allclose(rigid.about(3.0, -2.0).shift_u, moved_centre.shift_u)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 1.0, 3.0])
@@ -103,9 +105,9 @@ def test_rotation_vectors_and_matrices(size):
 
 def test_what_is_no_rigid_motion_is_refused():
     with pytest.raises(InputError, match="rotation"):
-        RigidMotion(translation=np.zeros((4, 3)), rotation=np.zeros((5, 3)))
+        RigidMotion(translation=np.zeros((4, 3)), rotation=np.zeros((5, 3)), optics=np.ones((4, 5)))
     with pytest.raises(InputError, match="found 3 views, expected 7"):
-        geometry().with_motion(RigidMotion.identity(3))
+        geometry().with_motion(RigidMotion.of(geometry(3)))
     skewed = geometry()
     skewed = type(skewed)(
         source=skewed.source,
@@ -115,4 +117,4 @@ def test_what_is_no_rigid_motion_is_refused():
         shape=skewed.shape,
     )
     with pytest.raises(InputError, match="expected 90"):
-        skewed.with_motion(RigidMotion.identity(7))
+        skewed.with_motion(RigidMotion.of(geometry()))

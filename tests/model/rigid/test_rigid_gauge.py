@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from clra.model.gauge.rigid_gauge import between, without_rigid_gauge
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.rigid_motion import RigidMotion, rotation_matrices
+from clra.model.rigid.rigid_gauge import between, without_rigid_gauge
+from clra.model.rigid.rigid_motion import RigidMotion, rotation_matrices
 from clra.model.trajectory import helix
 
 
@@ -25,9 +25,7 @@ POINTS = np.random.default_rng(7).uniform(-3, 3, (150, 3))
 
 def test_motion_between_geometries_is_that_which_was_absorbed():
     random = np.random.default_rng(0)
-    motion = RigidMotion(
-        translation=random.normal(size=(24, 3)), rotation=0.2 * random.normal(size=(24, 3))
-    )
+    motion = RigidMotion.of(scan(), random.normal(size=(24, 6)) * [1, 1, 1, 0.2, 0.2, 0.2])
     found = between(scan(), scan().with_motion(motion))
     assert np.allclose(found.table, motion.table, atol=1e-12)
 
@@ -50,10 +48,8 @@ def test_a_moved_sample_is_no_motion():
 
 def test_jitter_stays():
     random = np.random.default_rng(1)
-    jitter = RigidMotion(
-        translation=0.05 * random.normal(size=(24, 3)),
-        rotation=0.002 * random.normal(size=(24, 3)),
-    )
+    size = [0.05, 0.05, 0.05, 0.002, 0.002, 0.002]
+    jitter = RigidMotion.of(scan(), size * random.normal(size=(24, 6)))
     once = without_rigid_gauge(jitter, scan(), POINTS)
     twice = without_rigid_gauge(once, scan(), POINTS)
     assert np.allclose(once.table, twice.table, atol=1e-4)  # depth comes after the least squares

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
-from clra.model.validation import same_views, vectors, whole
-
-if TYPE_CHECKING:
-    from clra.model.geometry import ConeBeamGeometry
-    from clra.model.motion import Motion
+from clra.model.motion import Motion
+from clra.model.validation import same_views, selection, vectors
 
 Floats = NDArray[np.float64]
 
@@ -21,15 +18,42 @@ PARAMETERS = ("along_u", "along_v", "along_beam", "tilt", "spin", "roll")
 """Translations [mm] along, then rotations [rad] about, a view's u, v and beam axes."""
 
 
+class ViewPoses(Protocol):
+    """What of a :class:`clra.ConeBeamGeometry` a motion needs to know."""
+
+    @property
+    def source(self) -> Floats: ...  # noqa: D102
+    @property
+    def detector(self) -> Floats: ...  # noqa: D102
+    @property
+    def u(self) -> Floats: ...  # noqa: D102
+    @property
+    def v(self) -> Floats: ...  # noqa: D102
+    @property
+    def views(self) -> int: ...  # noqa: D102
+    @property
+    def rows(self) -> int: ...  # noqa: D102
+    @property
+    def columns(self) -> int: ...  # noqa: D102
+    @property
+    def normal(self) -> Floats: ...  # noqa: D102
+    @property
+    def principal(self) -> Floats: ...  # noqa: D102
+    @property
+    def source_to_axis(self) -> Floats: ...  # noqa: D102
+    @property
+    def source_to_detector(self) -> Floats: ...  # noqa: D102
+
+
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class RigidMotion:
+class RigidMotion(Motion):
     """How the sample moved in each view, in the axes of that view's detector.
 
     The axes are those of u, of v and of the detector's normal, which points away from the source;
     the origin is the point at the depth of the rotation axis on the perpendicular from the source
     to the detector, whichever part of the detector is used. A point of the sample that the ideal
-    geometry has at X in these axes lies at ``Exp(rotation) X + translation``. Detectors whose rows and columns are not perpendicular are
-    refused where a geometry absorbs the motion.
+    geometry has at X in these axes lies at ``Exp(rotation) X + translation``. Its `shift_u`,
+    `shift_v` and `magnification` are those of a point at the depth of the axis.
 
     Parameters
     ----------
@@ -38,6 +62,8 @@ class RigidMotion:
         [mm at the sample].
     rotation : array_like, (views, 3)
         Rotation vector about the same axes [rad]; a roll is positive from u toward v.
+    optics : array_like, (views, 5)
+        As :func:`optics_of` gives it for the ideal geometry.
 
     Raises
     ------
@@ -47,61 +73,70 @@ class RigidMotion:
 
     translation: Floats
     rotation: Floats
+    optics: Floats
 
-    def __init__(self, *, translation: ArrayLike, rotation: ArrayLike) -> None:
+    def __init__(self, *, translation: ArrayLike, rotation: ArrayLike, optics: ArrayLike) -> None:
         object.__setattr__(self, "translation", vectors("translation", translation, "views"))
         object.__setattr__(self, "rotation", vectors("rotation", rotation, "views"))
-        same_views(translation=self.translation, rotation=self.rotation)
+        known = np.array(optics, np.float64)
+        if known.ndim != 2 or known.shape[1] != 5 or not np.isfinite(known).all():
+            raise InputError(f"optics: found shape {known.shape}, expected finite (views, 5)")
+        known.flags.writeable = False
+        object.__setattr__(self, "optics", known)
+        same_views(translation=self.translation, rotation=self.rotation, optics=known)
+        near, per_u, per_v, aside_u, aside_v = known.T
+        depth = near + self.translation[:, 2]
+        magnification = near / depth
+        super().__init__(
+            shift_u=self.translation[:, 0] * per_u / depth + (1 - magnification) * aside_u,
+            shift_v=self.translation[:, 1] * per_v / depth + (1 - magnification) * aside_v,
+            magnification=magnification,
+            cause="sample",
+        )
 
     @classmethod
-    def identity(cls, views: int) -> RigidMotion:
-        """Return no motion of `views` views."""
-        still = np.zeros((whole("views", views), 3))
-        return cls(translation=still, rotation=still)
+    def of(cls, geometry: ViewPoses, table: ArrayLike | None = None) -> RigidMotion:
+        """Return a motion of the views of a geometry.
+
+        Parameters
+        ----------
+        geometry : ConeBeamGeometry
+            Ideal one.
+        table : array_like, (views, 6), optional
+            Numbers in the order of :data:`PARAMETERS`; no motion by default.
+        """
+        numbers = np.zeros((geometry.views, 6)) if table is None else np.asarray(table, np.float64)
+        return cls(translation=numbers[:, :3], rotation=numbers[:, 3:], optics=optics_of(geometry))
 
     @classmethod
-    def from_table(cls, table: ArrayLike) -> RigidMotion:
-        """Return the motion whose numbers are (views, 6), in the order of :data:`PARAMETERS`."""
-        numbers = np.asarray(table, np.float64)
-        return cls(translation=numbers[:, :3], rotation=numbers[:, 3:])
-
-    @classmethod
-    def from_shifts(cls, motion: Motion, geometry: ConeBeamGeometry) -> RigidMotion:
+    def from_shifts(cls, motion: Motion, geometry: ViewPoses) -> RigidMotion:
         """Return the translations that show at the depth of the axis what a `Motion` shows.
 
         Parameters
         ----------
         motion : Motion
-            Shifts and magnifications of the detector's images.
+            Shifts and magnifications, whatever caused them.
         geometry : ConeBeamGeometry
             Ideal one, of the same views.
         """
-        if motion.cause != "detector":
-            raise InputError("motion: found one of the source, expected shifts of the radiographs")
-        near, far = geometry.source_to_axis, geometry.source_to_detector
-        pixel = np.stack([np.linalg.norm(a, axis=1) for a in (geometry.u, geometry.v)], axis=1)
+        near, per_u, per_v, aside_u, aside_v = optics_of(geometry).T
         depth = near / motion.magnification  # what is nearer to the source appears larger
-        shifts = np.stack([motion.shift_u, motion.shift_v], axis=1)
-        shifts -= _about_centre(geometry, motion.magnification)
+        lost = 1 - motion.magnification
         table = np.zeros((motion.views, 6))
-        table[:, :2] = shifts * pixel * (depth / far)[:, None]
+        table[:, 0] = (motion.shift_u - lost * aside_u) * depth / per_u
+        table[:, 1] = (motion.shift_v - lost * aside_v) * depth / per_v
         table[:, 2] = depth - near
-        return cls.from_table(table)
+        return cls.of(geometry, table)
 
-    @property
-    def views(self) -> int:
-        """Number of views."""
-        return len(self.translation)
-
-    def __len__(self) -> int:
-        """Return the number of views."""
-        return self.views
+    def with_table(self, table: Floats) -> RigidMotion:
+        """Return a motion of the same views with other numbers, (views, 6)."""
+        return RigidMotion(translation=table[:, :3], rotation=table[:, 3:], optics=self.optics)
 
     def __eq__(self, other: object) -> bool:
         """Compare exactly, number by number."""
         if not isinstance(other, RigidMotion):
             return NotImplemented
-        return np.array_equal(self.table, other.table)
+        return np.array_equal(self.table, other.table) and np.array_equal(self.optics, other.optics)
 
     def __repr__(self) -> str:
         """Summarise the ranges."""
@@ -118,7 +153,7 @@ class RigidMotion:
         """All numbers, (views, 6), in the order of :data:`PARAMETERS`."""
         return np.concatenate([self.translation, self.rotation], axis=1)
 
-    def then(self, residual: RigidMotion) -> RigidMotion:
+    def then(self, residual: Motion) -> RigidMotion:
         """Return this motion followed by `residual`.
 
         Parameters
@@ -129,49 +164,54 @@ class RigidMotion:
         Raises
         ------
         InputError
-            If it is of another number of views.
+            If it is of another number of views, or no rigid motion.
         """
-        if residual.views != self.views:
-            raise InputError(f"residual: found {residual.views} views, expected {self.views}")
+        if not isinstance(residual, RigidMotion) or residual.views != self.views:
+            raise InputError(f"residual: found {residual!r}, expected {self.views} rigid motions")
         turn = rotation_matrices(residual.rotation)
         moved = np.einsum("nij,nj->ni", turn, self.translation) + residual.translation
-        together = turn @ rotation_matrices(self.rotation)
-        return RigidMotion(translation=moved, rotation=rotation_vectors(together))
+        together = rotation_vectors(turn @ rotation_matrices(self.rotation))
+        return self.with_table(np.concatenate([moved, together], axis=1))
 
     def inverse(self) -> RigidMotion:
         """Return the motion that undoes this one: ``motion.then(motion.inverse())`` is none."""
         back = rotation_matrices(-self.rotation)
         moved = -np.einsum("nij,nj->ni", back, self.translation)
-        return RigidMotion(translation=moved, rotation=-self.rotation)
+        return self.with_table(np.concatenate([moved, -self.rotation], axis=1))
 
-    def about(self, offset_u: float, offset_v: float) -> RigidMotion:
-        """Return the same motion, which no window of the detector changes, see `Motion.about`."""
+    def normalised(self) -> RigidMotion:
+        """Return the motion as it is: its gauge is another, see `without_rigid_gauge`."""
         return self
 
-    def subset(self, index: ArrayLike) -> RigidMotion:
-        """Return the motion of some views."""
-        chosen = np.asarray(index)
-        return RigidMotion(translation=self.translation[chosen], rotation=self.rotation[chosen])
+    def about(self, offset_u: float, offset_v: float) -> RigidMotion:
+        """Return the same motion, whose shifts are those of another centre, see `Motion.about`."""
+        optics = self.optics - np.array([0, 0, 0, offset_u, offset_v])
+        return RigidMotion(translation=self.translation, rotation=self.rotation, optics=optics)
 
-    def in_pixels(self, geometry: ConeBeamGeometry) -> Floats:
-        """Return what a point at the depth of the axis shows of it, (views, 6).
-
-        Translations along u and v in pixels of the detector, the one along the beam as a change of
-        the magnification, rotations in degrees.
-        """
-        near, far = geometry.source_to_axis, geometry.source_to_detector
-        table = self.table
-        depth = near + table[:, 2]
-        aside = _about_centre(geometry, near / depth)
-        for k, step in enumerate((geometry.u, geometry.v)):
-            table[:, k] *= far / depth / np.linalg.norm(step, axis=1)
-            table[:, k] += aside[:, k]
-        table[:, 2] = near / depth - 1
-        table[:, 3:] = np.degrees(table[:, 3:])
-        return table
+    def subset(self, index: slice | ArrayLike) -> RigidMotion:
+        """Return the motion of some of the views."""
+        chosen = selection(index)
+        return RigidMotion(
+            translation=self.translation[chosen],
+            rotation=self.rotation[chosen],
+            optics=self.optics[chosen],
+        )
 
 
-def absorb(geometry: ConeBeamGeometry, motion: RigidMotion) -> dict[str, Floats]:
+def optics_of(geometry: ViewPoses) -> Floats:
+    """Return how views show translations, (views, 5).
+
+    Columns are the distance from source to axis [mm], that to the detector in steps of columns and
+    of rows, and column and row of the principal point from the detector's centre [pixel].
+    """
+    far = geometry.source_to_detector
+    centre = np.array([geometry.columns - 1, geometry.rows - 1]) / 2
+    per_u, per_v = (far / np.linalg.norm(step, axis=1) for step in (geometry.u, geometry.v))
+    aside = geometry.principal - centre
+    return np.stack([geometry.source_to_axis, per_u, per_v, aside[:, 0], aside[:, 1]], axis=1)
+
+
+def absorb(geometry: ViewPoses, motion: RigidMotion) -> dict[str, Floats]:
     """Return the four vectors, by name, of views that see the sample as it had moved.
 
     Turning the sample by R about c and moving it by t is turning source and detector back:
@@ -195,18 +235,12 @@ def absorb(geometry: ConeBeamGeometry, motion: RigidMotion) -> dict[str, Floats]
     }
 
 
-def turning_centre(geometry: ConeBeamGeometry) -> Floats:
+def turning_centre(geometry: ViewPoses) -> Floats:
     """Return the origin of each view's axes, (views, 3) [mm]."""
     return np.asarray(geometry.source + geometry.normal * geometry.source_to_axis[:, None])
 
 
-def _about_centre(geometry: ConeBeamGeometry, magnification: Floats) -> Floats:
-    """Shift with which magnifying about the principal point is magnifying about the centre."""
-    centre = np.array([geometry.columns - 1, geometry.rows - 1]) / 2
-    return np.asarray((1 - magnification)[:, None] * (geometry.principal - centre))
-
-
-def view_axes(geometry: ConeBeamGeometry) -> Floats:
+def view_axes(geometry: ViewPoses) -> Floats:
     """Return unit vectors of u, v and the normal as columns, (views, 3, 3).
 
     Raises

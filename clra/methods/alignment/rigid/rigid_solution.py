@@ -20,7 +20,7 @@ class RigidStep:
     Attributes
     ----------
     table : ndarray, (views, 6)
-        Translations [mm] and rotations [rad], as in `clra.model.rigid_motion.PARAMETERS`.
+        Translations [mm] and rotations [rad], as in `clra.model.rigid.rigid_motion.PARAMETERS`.
     sigma : ndarray, (views, 6)
         Standard errors of the noise, the prior included; NaN where not estimated.
     correlation : ndarray, (views,)
@@ -71,7 +71,7 @@ def solve(
 
     def variance(x: Floats) -> Floats:
         left = square - 2 * np.sum(x * right, axis=1) + np.einsum("ni,nij,nj->n", x, normal, x)
-        return np.maximum(left, 1e-12 * square) / weight
+        return np.asarray(np.maximum(left, 1e-12 * square) / weight)
 
     plain = np.linalg.solve(normal + ridge, right[:, :, None])[:, :, 0]
     noise = correlated * variance(plain)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.rigid_motion import (
+from clra.model.rigid.rigid_motion import (
     RigidMotion,
     rotation_matrices,
     rotation_vectors,
@@ -34,7 +34,8 @@ def between(nominal: ConeBeamGeometry, moved: ConeBeamGeometry) -> RigidMotion:
     seen = np.einsum("nji,nj->ni", axes, nominal.source - centre)
     apart = np.einsum("nji,nj->ni", axes, moved.source - centre)
     translation = seen - np.einsum("nij,nj->ni", in_axes, apart)
-    return RigidMotion(translation=translation, rotation=rotation_vectors(in_axes))
+    table = np.concatenate([translation, rotation_vectors(in_axes)], axis=1)
+    return RigidMotion.of(nominal, table)
 
 
 def without_rigid_gauge(
@@ -88,4 +89,4 @@ def without_rigid_gauge(
     table = between(nominal, anchored).table
     kept = 0.0 if reference is None else reference.table[:, 2].mean()
     table[:, 2] += kept - table[:, 2].mean()
-    return RigidMotion.from_table(table)
+    return motion.with_table(table)

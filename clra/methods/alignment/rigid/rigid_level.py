@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reprojection import binned_mask
-from clra.methods.alignment.rigid_solution import RigidStep, solve
+from clra.methods.alignment.rigid.rigid_solution import RigidStep, solve
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.rigid_motion import RigidMotion
+from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 from clra.ops.registration.rigid_registration import (
     IMAGES,
@@ -48,7 +48,7 @@ class RigidLevel:
     factor : int
         Binning.
     free : tuple of int
-        Parameters to estimate, of `clra.model.rigid_motion.PARAMETERS`.
+        Parameters to estimate, of `clra.model.rigid.rigid_motion.PARAMETERS`.
     prior : ndarray, (6,)
         Expected standard deviation of each parameter [mm, rad]; 0 for unknown.
     """
