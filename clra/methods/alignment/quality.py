@@ -28,7 +28,9 @@ VERDICTS = ("good", "doubtful", "failed")
 # Errors are so many times what held-out views see of them: the rest is in slow modes, which all
 # parts of the views share; on arcs of less than a turn there are more of them. Over the kinds of
 # `tools/stress.py` errors are 0.8 to 2 times, and 2 to 5 times, what is seen.
-_UNSEEN, _UNSEEN_ON_ARCS, _UNSEEN_OF_CUT_OFF = 1.4, 2.5, 4.0
+_UNSEEN, _UNSEEN_ON_ARCS, _UNSEEN_OF_CUT_OFF = 1.2, 2.2, 4.0
+# Views below which what is seen is mostly that they hardly predict each other.
+_MANY = 100
 # Mean absolute error over root mean square, of normal errors.
 _MEAN = 0.8
 # Quantile of the views' residuals above which a view counts as misplaced, and the part of what
@@ -153,7 +155,8 @@ def assess(
         aligned = replace(aligned, motion=start)
         after = predicted(start, True, "start")
     left = gauge.of(after)
-    sigma = _standard_errors(aligned, left, after, _unseen(scan, radiographs))
+    unseen = _unseen(scan, radiographs) * min(1.0, np.sqrt(len(views) / _MANY))
+    sigma = _standard_errors(aligned, left, after, unseen)
     error = float(_MEAN * np.nanmean(sigma[:, :2], axis=0).max())
     quality = Quality(
         verdict="good",
