@@ -3,9 +3,10 @@
 // W(x) = sum over views of the view's weight times that of the row that x falls on, linear between
 // rows, 0 for a view on whose detector [0, columns - 1] x [0, rows - 1] the projection does not
 // lie. Where rays have weights, W(x) is the part that such a sum is of the one without row weights
-// and without top and bottom of the detector. It varies over many voxels, so that it is computed once for a block of them, in its middle,
-// and interpolated linearly. The last block of an axis may be cut short by the grid's end: its
-// middle is `last` in units of whole blocks, at most their number less 1.
+// and without top and bottom of the detector. It varies over many voxels, so that it is computed
+// once for a block of them, in its middle, and interpolated linearly. The last block of an axis may
+// be cut short by the grid's end: its middle is `last` in units of whole blocks, at most their
+// number less 1.
 //
 // Global sizes, rounded up at will: of coverage one work-item a coarse voxel, (nz, nx, ny); of
 // normalise one a voxel, along the volume's axes from last to first.

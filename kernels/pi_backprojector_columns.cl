@@ -1,4 +1,4 @@
-// pi_backprojector.cl for CPUs. Back-projection over pi-intervals, for exact helical reconstruction:
+// pi_backprojector.cl for CPUs: back-projection over pi-intervals, for exact images from helices,
 // volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
 // bilinearly at the voxel's projection.
 //

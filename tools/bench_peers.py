@@ -182,4 +182,62 @@ class Leap:
         return models
 
 
-PEERS: dict[str, Callable[[], Peer]] = {"rtk": Rtk, "leap": Leap}
+class Astra:
+    """ASTRA on CUDA: its geometries are ours; runs include what goes to the GPU and comes back."""
+
+    name = "astra"
+
+    def __init__(self) -> None:
+        try:
+            import astra
+        except ImportError as error:
+            raise RuntimeError("ASTRA is not installed (conda install astra-toolbox)") from error
+        if not astra.use_cuda():
+            raise RuntimeError("ASTRA finds no CUDA")
+        self._astra = astra
+
+    def back(self, geometry: ConeBeamGeometry, grid: VolumeGrid, projections: Floats) -> Run:
+        """Back-project without weights."""
+        return self._runs(
+            "BP3D_CUDA", geometry, grid, projections, np.zeros(grid.shape, np.float32)
+        )
+
+    def forward(self, geometry: ConeBeamGeometry, grid: VolumeGrid, volume: Floats) -> Run:
+        """Project a volume."""
+        projections = np.zeros((geometry.views, *geometry.shape), np.float32)
+        return self._runs("FP3D_CUDA", geometry, grid, projections, volume)
+
+    def fdk(self, geometry: ConeBeamGeometry, grid: VolumeGrid, projections: Floats) -> Run:
+        """Filter and back-project."""
+        volume = np.zeros(grid.shape, np.float32)
+        return self._runs("FDK_CUDA", geometry, grid, projections, volume)
+
+    def _runs(
+        self,
+        algorithm: str,
+        geometry: ConeBeamGeometry,
+        grid: VolumeGrid,
+        projections: Floats,
+        volume: Floats,
+    ) -> Run:
+        astra = self._astra
+        nz, ny, nx = grid.shape
+        ends = [
+            end
+            for n, middle in zip((nx, ny, nz), grid.centre, strict=True)
+            for end in (middle - 0.5 * n * grid.voxel_size, middle + 0.5 * n * grid.voxel_size)
+        ]
+        volumes = astra.create_vol_geom(ny, nx, nz, *ends)
+        rows, columns = geometry.shape
+        cone = astra.create_proj_geom("cone_vec", rows, columns, geometry.to_astra())
+        # ASTRA's projections are (row, view, column).
+        sinograms = np.ascontiguousarray(projections.transpose(1, 0, 2))
+        settings = astra.astra_dict(algorithm)
+        settings["ProjectionDataId"] = astra.data3d.link("-sino", cone, sinograms)
+        name = "VolumeDataId" if algorithm == "FP3D_CUDA" else "ReconstructionDataId"
+        settings[name] = astra.data3d.link("-vol", volumes, volume)
+        made = astra.algorithm.create(settings)
+        return lambda: astra.algorithm.run(made)
+
+
+PEERS: dict[str, Callable[[], Peer]] = {"rtk": Rtk, "leap": Leap, "astra": Astra}

@@ -142,11 +142,11 @@ LIMITS = (
         {"all": 72}, registers=72, defines={"INSIDE": 4},
     ),
     Limit(
-        "adjoint.cl", "adjoint_leaning", "adjoint, tilted, 2 rows", by_columns(8),
+        "adjoint_leaning.cl", "adjoint_leaning", "adjoint, tilted, 2 rows", by_columns(8),
         {"all": 150}, registers=96, defines={"INSIDE": 2},
     ),
     Limit(
-        "adjoint.cl", "adjoint_leaning", "adjoint, tilted, 3 rows", by_columns(8),
+        "adjoint_leaning.cl", "adjoint_leaning", "adjoint, tilted, 3 rows", by_columns(8),
         {"all": 150}, registers=96, defines={"INSIDE": 3},
     ),
     # Rays that advance fastest along z, and detectors turned by more than 45 degrees.
@@ -181,7 +181,7 @@ def costs(folder: Path, architectures: Sequence[str]) -> Iterator[Cost]:
     """Compile what there are limits for; raises Missing where a compiler is not there."""
     nvdisasm = program("nvdisasm", "pip install nvidia-cuda-nvdisasm")
     for limit in LIMITS:
-        defines = {**grouped(limit.file, limit.kernel), **(limit.defines or {})}
+        defines = {**grouped(limit.file), **(limit.defines or {})}
         for architecture in architectures:
             report = nvidia_code(limit.file, folder, architecture, defines)
             usages = read_ptxas(report, limit.file, architecture, 1 << 20)
@@ -200,7 +200,7 @@ def amd_costs(folder: Path) -> Iterator[Cost]:
     """Count the loops of the kernels with limits for gfx90a."""
     for limit in LIMITS:
         if limit.kernel in AMD_LIMITS:
-            defines = {**grouped(limit.file, limit.kernel), **(limit.defines or {})}
+            defines = {**grouped(limit.file), **(limit.defines or {})}
             amd_code(limit.file, folder, defines, "-S", "-o", "k.s")
             loops = amd_kernels((folder / "k.s").read_text())[limit.kernel]
             rates = dict(limit.per_unit(loops))

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from compilers import APT, clang, data, defined, program, run
 
-from clra.kernels.header import signatures
 from clra.ops.runtime.build import BUILD_OPTIONS
 
 MOST_REGISTERS = 64
@@ -27,6 +26,7 @@ MORE_REGISTERS = {
 # and definitions.
 GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "adjoint.cl": (256, {"VOXELS": 16, "COLUMNS": 1024}),
+    "adjoint_leaning.cl": (256, {"VOXELS": 8, "COLUMNS": 1024}),
     "backproject.cl": (256, {"VOXELS": 16, "COLUMNS": 1024}),
     "bandpass.cl": (128, {"LANES": 2}),
     "blur.cl": (128, {"LANES": 2}),
@@ -46,8 +46,6 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),
 }
-# Kernels that are built otherwise than the rest of their file.
-KERNEL_FORMS: Mapping[str, Mapping[str, int]] = {"adjoint_leaning": {"VOXELS": 8}}
 # Kernels that run in other groups than the rest of their file.
 WORK_GROUPS: Mapping[str, int] = {
     "normalise": 64,
@@ -143,28 +141,18 @@ def nvidia_code(file: str, folder: Path, architecture: str, defines: Mapping[str
     return run([ptxas, "-v", f"-arch={architecture}", "-o", "k.cubin", "k.ptx"], folder)
 
 
-def grouped(file: str, kernel: str = "") -> dict[str, int]:
-    """Definitions of a file, or of one of its kernels, with those of the groups."""
+def grouped(file: str) -> dict[str, int]:
+    """Definitions of a file with those of its groups."""
     group, defines = GPU_FORMS[file]
     x, y = SHAPES[group]
-    return {"GROUP_X": x, "GROUP_Y": y, **defines, **KERNEL_FORMS.get(kernel, {})}
-
-
-def variants(file: str) -> Iterator[tuple[set[str], dict[str, int]]]:
-    """Kernels of a file that are built alike, and with which definitions."""
-    names = {one.name for one in signatures(file)}
-    for name in names & KERNEL_FORMS.keys():
-        yield {name}, grouped(file, name)
-    yield names - KERNEL_FORMS.keys(), grouped(file)
+    return {"GROUP_X": x, "GROUP_Y": y, **defines}
 
 
 def nvidia(file: str, folder: Path) -> Iterator[Usage]:
     """Compile a file for each architecture."""
     for architecture, shared in _SHARED.items():
-        for names, defines in variants(file):
-            report = nvidia_code(file, folder, architecture, defines)
-            found = read_ptxas(report, file, architecture, shared)
-            yield from (one for one in found if one.kernel.split()[-1] in names)
+        report = nvidia_code(file, folder, architecture, grouped(file))
+        yield from read_ptxas(report, file, architecture, shared)
 
 
 def read_ptxas(report: str, file: str, architecture: str, shared: int) -> Iterator[Usage]:
@@ -229,10 +217,8 @@ def amd_code(file: str, folder: Path, defines: Mapping[str, int], *output: str) 
 
 def amd(file: str, folder: Path) -> Iterator[Usage]:
     """Compile a file for gfx90a."""
-    for names, defines in variants(file):
-        report = amd_code(file, folder, defines, "-c", "-o", "/dev/null")
-        found = read_remarks(report, file)
-        yield from (one for one in found if one.kernel.split()[-1] in names)
+    report = amd_code(file, folder, grouped(file), "-c", "-o", "/dev/null")
+    yield from read_remarks(report, file)
 
 
 def read_remarks(report: str, file: str) -> Iterator[Usage]:

@@ -35,6 +35,7 @@ COMMANDS = {
     "wood": "figure4_small.py --scale 16 -o FOLDER",
     "imgr": "imgr_small.py",
     "memory": "memory_peaks.py",
+    "gpu": "check_gpu.py --only limits",
     "bench": "bench.py --peer rtk --long",
 }
 

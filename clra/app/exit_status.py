@@ -69,7 +69,7 @@ def keeping(checkpoint: "Checkpoint") -> Iterator[None]:
             raise
         raise InterruptedCommandError(_goes_on(checkpoint)) from None
     except Exception as error:
-        if checkpoint.kept:
+        if checkpoint.kept and not isinstance(error, InterruptedCommandError):
             error.add_note(_goes_on(checkpoint))
         raise
 

@@ -70,9 +70,9 @@ def test_alignment_on_a_device_that_fails(clra, monkeypatch, how, scan, scan_fil
     assert not (tmp_path / "motion.h5").exists()
 
 
-def test_the_first_use_is_told(clra, monkeypatch, scan_file, tmp_path):
+def test_the_first_use_is_told(monkeypatch, scan):
     replace_trials(monkeypatch, [RIGHT])
     for told in (True, False):
-        status, _, err = clra("reconstruct", scan_file, "-o", tmp_path / f"{told}.h5")
-        assert status == 0, err
-        assert (self_test.STAGE in err) == told
+        progress = []
+        library.reconstruct(scan, progress=progress.append)
+        assert (self_test.STAGE in [step.stage for step in progress]) == told

@@ -151,7 +151,9 @@ def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
     refused(done, 1, "too many voxels; ", folder, "keeps 1 iteration, the last at HR, --resume")
     assert not out.exists()
     stop(KeyboardInterrupt())
-    refused(clra(*command, "--resume"), 130, out, "keeps what 1 iteration", "--resume goes on")
+    done = clra(*command, "--resume")
+    refused(done, 130, out, "keeps what 1 iteration", "--resume goes on")
+    assert done[2].count("--resume") == 1
     assert len(read_alignment(out).history) == 1
     monkeypatch.undo()
     assert clra(*command, "--resume", "--quiet") == (0, "", "")
@@ -161,7 +163,7 @@ def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
 @pytest.mark.filterwarnings("default")
 def test_imgr_crops_masked_detectors_and_tells_of_truncation(clra, tmp_path):
     geometry = paper_like("circular", 24, (24, 33))
-    wide = Ellipsoids([[0, 0, 0]], [[3.0, 3.0, 3.0]], [0.1]).line_integrals(geometry)
+    wide = Ellipsoids([[0.4, 0.2, 0]], [[1.5, 1.5, 1.5]], [0.5]).line_integrals(geometry)
     mask = np.ones(geometry.shape, np.bool_)
     mask[:, :4] = False
     path, out = tmp_path / "masked.nxs", tmp_path / "v.h5"

@@ -15,8 +15,8 @@ from clra.app.report.summary import Errors, Findings, Floats
 from clra.app.report.verdict_box import verdict_box
 from clra.app.scan_description import listed
 from clra.io.atomic import atomic_path
-from clra.methods.alignment.agreement import Agreement
 from clra.methods.alignment.result import Iteration
+from clra.methods.assessment.agreement import Agreement
 
 _COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
 _UNOBSERVABLE = {

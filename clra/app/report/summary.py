@@ -12,6 +12,7 @@ from clra.app.progress_bar import duration
 from clra.app.scan_description import Facts, table, views_flagged
 from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.alignment.quality import Quality
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
@@ -19,7 +20,7 @@ from clra.model.scan import Scan
 
 if TYPE_CHECKING:
     from clra.app.report.comparison import Comparison
-    from clra.methods.alignment.agreement import Agreement
+    from clra.methods.assessment.agreement import Agreement
     from clra.progress import ProgressCallback
 
 Floats = NDArray[np.float64]
@@ -143,7 +144,7 @@ def findings_of(
     if scan is None:
         return Findings(result)
     from clra.app.report.comparison import compare, volume_level
-    from clra.methods.alignment.agreement import agreement
+    from clra.methods.assessment.agreement import agreement
     from clra.ops.streaming.stream import Stream
 
     stream = Stream(
@@ -220,7 +221,9 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "quality": None if result.quality is None else result.quality.as_dict(),
         **(errors.means() if errors else {}),
     }
-    lines = {
+    judged = result.quality
+    lines = {"verdict": _verdict(judged)} if isinstance(judged, Quality) else {}
+    lines |= {
         "run": f"{motion.views} views, {_levels(result)}, {duration(seconds)}",
         "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
         f"largest {largest_u:.2f}, {largest_v:.2f}",
@@ -243,7 +246,17 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         lines["error"] = _error(means, "", result)
         if result.flagged:
             lines["not flagged"] = _error(means, "valid_", result)
-    return values, table(lines)
+    # Last, where they are seen: numbers above may flatter.
+    told = [f"{f.severity}: {f}" for f in result.warnings if f.severity != "info"]
+    return values, "\n".join([table(lines), *told])
+
+
+def _verdict(quality: Quality) -> str:
+    before, after = (100 * r for r in (quality.residual_before, quality.residual_after))
+    return (
+        f"{quality.verdict}; expected error {quality.error:.2f} pixel; {after:.1f} % of a held-out "
+        f"radiograph not predicted, {before:.1f} % at the start"
+    )
 
 
 def _unobservable(result: AlignmentResult) -> str:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.alignment.align import align
-from clra.methods.alignment.axis_of_arc import axis_offset
-from clra.methods.alignment.slice_sharpness import VIEWS, Slices
+from clra.methods.assessment.axis_of_arc import axis_offset
+from clra.methods.assessment.slice_sharpness import VIEWS, Slices
 from clra.model.detector_pose import with_detector
 from clra.model.sampling.angular_coverage import covered, is_circle
 from clra.model.scan import Scan
@@ -89,7 +89,7 @@ def autofocus(
     ----------
     scan : Scan
         Any trajectory; it may have moved. Of an arc the axis alone is found, by the rays that are
-        measured twice (:func:`clra.methods.alignment.axis_of_arc.axis_offset`).
+        measured twice (:func:`clra.methods.assessment.axis_of_arc.axis_offset`).
     device : str or cl.Device, optional
         As :func:`clra.ops.runtime.devices.choose_device` takes it.
     progress : callable, optional

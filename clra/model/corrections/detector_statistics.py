@@ -28,6 +28,8 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _NEAR = (1, 2)
 # Fewer columns, or rows, do not tell which of them are dead: scans of two rows are no rarity.
 _FEWEST = 12
+# Below so many rows or columns a sample's details are no wider than a bad pixel.
+_SMALL = 40
 # Chance at which a good pixel is called insensitive or standing out because of noise alone.
 _CHANCE = 1e-10
 # A pixel's variance is this part of its neighbours', at most, if it is insensitive: samples with
@@ -152,6 +154,8 @@ class DetectorStatistics:
         known[rows], known[:, columns] = True, True
         # Beside a dead line pixels are compared with what lies beyond it.
         mean, variance = _filled(mean, rows, columns), _filled(variance, rows, columns)
+        if min(mean.shape) < _SMALL:
+            return BadPixels(known, rows, columns)
         bad = known | self._insensitive(variance) | self._standing_out(mean, variance)
         return BadPixels(bad, rows, columns)
 
@@ -270,7 +274,8 @@ def _excess(mean: Floats, step: tuple[int, int], distance: int) -> tuple[Floats,
     above, below = mean - near[2], near[1] - mean
     return (
         np.maximum(above, below),
-        near[2] - near[1],
+        # Of three of them: two may be alike by chance, such as on either side of a round sample.
+        np.minimum(near[3] - near[1], near[2] - near[0]),
         np.where(above > below, np.float32(1), np.float32(-1)),
     )
 

@@ -205,7 +205,8 @@ class GpuAdjoint:
             voxels = _ADJOINT_VOXELS.get(kernel, 1)
             defines = {**size_constants(self._layout), "VOXELS": voxels}
             context = self._layout.context
-            self._steps[kernel] = Step(context, "adjoint.cl", kernel, _GROUP, defines)
+            file = "adjoint_leaning.cl" if kernel == "adjoint_leaning" else "adjoint.cl"
+            self._steps[kernel] = Step(context, file, kernel, _GROUP, defines)
         return self._steps[kernel]
 
     @property

@@ -8,7 +8,7 @@ import pytest
 import clra
 from clra.app.simulation import paper_like, sample, simulated_motion
 from clra.methods.alignment.autofocus import Focus, autofocus
-from clra.methods.alignment.slice_sharpness import sharpening_by_opposite_rotation
+from clra.methods.assessment.slice_sharpness import sharpening_by_opposite_rotation
 from clra.model.detector_pose import with_detector
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid

@@ -264,7 +264,7 @@ def test_options_that_are_none():
     scan = clra.Scan(np.zeros((3, 4, 4), np.float32), geometry)
     with pytest.raises(ValueError, match="method: found 'magic', expected one of"):
         clra.reconstruct(scan, method="magic")
-    with pytest.raises(ValueError, match="found both"):
+    with pytest.raises(ValueError, match="found more than one"):
         clra.reconstruct(scan, motion=clra.Motion.identity(3), align=True)
 
 

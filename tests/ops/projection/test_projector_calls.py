@@ -53,6 +53,21 @@ def test_a_view_that_misses_the_volume_gives_nothing(queue, form):
     assert not back(queue, geometry, grid, projections, matched=True).any()
 
 
+@pytest.mark.parametrize("name", ["helix", "space-filling", "v down", "tilted"])
+def test_heights_are_what_a_view_sees(queue, name):
+    """No voxel beyond them gets anything; of axial views those at the ends do."""
+    geometry = GEOMETRIES[name]
+    ones = on_device(queue, np.ones((1, *geometry.shape)))
+    for view, (bottom, top) in enumerate(layout.heights(geometry, GRID)):
+        volume = cl_array.empty(queue, GRID.shape, np.float32)
+        one = geometry.subset(slice(view, view + 1))
+        BackProjector(queue.context, one, GRID)(queue, volume, ones).wait()
+        seen = np.flatnonzero(volume.get().any(axis=(1, 2)))
+        assert not len(seen) or (bottom <= seen[0] and seen[-1] < top)
+        if geometry.axial:
+            assert len(seen) >= top - bottom - 3
+
+
 @pytest.mark.parametrize("small", [False, True], ids=["at once", "in parts"])
 @forms
 def test_views_may_come_in_chunks(queue, monkeypatch, request, form, small):

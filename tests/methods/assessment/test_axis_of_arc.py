@@ -7,7 +7,7 @@ import pytest
 
 import clra
 from clra.methods.alignment.autofocus import autofocus
-from clra.methods.alignment.axis_of_arc import axis_offset
+from clra.methods.assessment.axis_of_arc import axis_offset
 from clra.model.detector_pose import with_detector
 from clra.model.phantoms.ellipsoids import Ellipsoids
 from clra.ops.streaming.stream import Stream

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from clra.errors import InputError
 from clra.findings import Finding
@@ -79,7 +80,8 @@ def radiograph_findings(scan: Scan) -> list[Finding]:
     views = views[~odd]
     if not images:
         return []
-    bright = np.array([np.quantile(image, 0.02) for image in images])
+    # Means over some pixels: the brightest single ones are noise.
+    bright = np.array([np.quantile(uniform_filter(image, 9), 0.05) for image in images])
     most = max(float(np.quantile(image, 0.999)) for image in images)
     found = [_fading(bright, views), *_clipped(images[:: max(1, len(images) // _CLOSELY)])]
     columns = np.array([_border(image[:, [0, -1]]) for image in images]) - bright[:, None]
@@ -157,7 +159,8 @@ def _noisy(image: NDArray[np.float32], lowest: float) -> bool:
     for _ in range(4):
         values, clear = np.diff(values, axis=1), clear[:, 1:] & clear[:, :-1]
     both = clear[:, 1:] & clear[:, :-1]
-    if both.sum() < 100:
+    # Rounding alternates, too.
+    if both.sum() < 100 or np.median(np.abs(values[clear])) < 2e-3 * float(image.max()):
         return False
     # The edges of the sample are few: signs, so that large products do not count more.
     signs = np.sign(values[:, 1:][both]) * np.sign(values[:, :-1][both])
