@@ -5,7 +5,6 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from clra.methods.alignment.quality import Quality
 
 from clra.app.report.comparison import Comparison, MatchedView, Pair
 from clra.app.report.html_report import render, write_report
@@ -13,6 +12,7 @@ from clra.app.report.page import embedded
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
 from clra.findings import Finding
+from clra.methods.alignment.quality import Quality
 from clra.methods.alignment.result import AlignmentResult
 from clra.methods.assessment.agreement import Agreement
 from clra.model.motion import Motion

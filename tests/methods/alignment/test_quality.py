@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clra.methods.alignment.quality import Quality, assess, judged
 
 import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
+from clra.methods.alignment.quality import Quality, assess, judged
 from clra.methods.alignment.result import AlignmentResult
 from clra.ops.streaming.stream import Stream
 
