@@ -9,6 +9,7 @@ from typer.main import get_command
 from clra.app.cli import app
 from clra.app.session.configuration import options_for, template
 from clra.errors import InputError
+from clra.model.grid import default_grid
 
 COMMANDS = get_command(app).commands
 
@@ -46,14 +47,14 @@ def test_what_no_command_knows_is_refused(tmp_path, text, message):
         options_for("align", _file(tmp_path, text), COMMANDS)
 
 
-def test_the_command_line_has_the_last_word(clra, scan_file, tmp_path):
+def test_the_command_line_has_the_last_word(clra, scan, scan_file, tmp_path):
     path = _file(tmp_path, f'scan = "{scan_file}"\n[reconstruct]\nbin = 2\nout = "a.h5"\n')
     out = tmp_path / "volume.h5"
     status, told, error = clra("reconstruct", "--config", path, "-o", out, "--json")
     assert status == 0, error
-    # Binned by 2, so is the detector of 41 x 33 pixels, and nz counts its rows.
-    assert json.loads(told)["shape"][0] <= 41
-    assert json.loads(told)["voxel_mm"] == pytest.approx(2 * 0.0363, rel=0.01)
+    expected = default_grid(scan.geometry.binned(2))
+    assert json.loads(told)["shape"] == list(expected.shape)
+    assert json.loads(told)["voxel_mm"] == pytest.approx(expected.voxel_size)
     assert out.exists() and not (tmp_path / "a.h5").exists()
     status, _, error = clra("reconstruct", "--config", path, "-o", out, "--bin", "0")
     assert status == 2 and "--bin: found 0" in error
