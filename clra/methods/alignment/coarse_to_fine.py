@@ -24,8 +24,8 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
 from clra.methods.alignment.reprojection import Registered
-from clra.methods.alignment.slow_modes import SlowSteps, held
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
+from clra.methods.alignment.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     history_from,
