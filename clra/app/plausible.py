@@ -10,7 +10,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 
 if TYPE_CHECKING:
-    from clra.methods.alignment.agreement import Agreement
+    from clra.methods.assessment.agreement import Agreement
 
 # Transmission that no sample causes, and the part of the pixels in which it may be all the same:
 # the rims of phase contrast are as bright, flats that fit badly are not.

@@ -93,6 +93,24 @@ def truncated(radiographs: Radiographs, geometry: ConeBeamGeometry) -> str:
     )
 
 
+def falls_outwards(radiographs: Radiographs) -> bool:
+    """Tell whether what is left at the border of the detector falls towards it.
+
+    A sample that reaches beyond does; scatter, or flats of another intensity, leave a level.
+
+    Parameters
+    ----------
+    radiographs : Radiographs
+        A few are read.
+    """
+    views, rows, columns = radiographs.shape
+    means = profiles(radiographs, slice(0, views), slice(0, rows))
+    inwards = columns // 10
+    left, right = means[:, inwards] - means[:, 0], means[:, -1 - inwards] - means[:, -1]
+    fall = float(np.quantile(np.maximum(left, right), _OFTEN))
+    return fall > AT_BORDER * float(means.max())
+
+
 def _border_values(
     radiographs: Radiographs, geometry: ConeBeamGeometry, views: NDArray[np.intp]
 ) -> tuple[float, float]:

@@ -232,8 +232,14 @@ def volume_grid(
     return whole._moved(shape, whole.voxel_size, (starts[0], starts[1], starts[2]))
 
 
-def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:
-    """Lowest and highest point of the axis that enough views see [mm]."""
+def axis_ranges(geometry: ConeBeamGeometry) -> tuple[Floats, Floats]:
+    """Lowest and highest point of the axis that each view sees, each (views,) [mm].
+
+    Raises
+    ------
+    InputError
+        If the rows of a view run along the axis.
+    """
     matrices = geometry.projection_matrices()
     ends = []
     for row in (-0.5, geometry.rows - 0.5):
@@ -244,6 +250,12 @@ def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:
     low, high = np.sort(ends, axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise InputError("the rows of a view run along the rotation axis: give a grid")
+    return low, high
+
+
+def _axis_range(geometry: ConeBeamGeometry) -> tuple[float, float]:
+    """Lowest and highest point of the axis that enough views see [mm]."""
+    low, high = axis_ranges(geometry)
     heights = np.sort(np.concatenate([low, high]))
     middles = 0.5 * (heights[1:] + heights[:-1])
     seen = np.searchsorted(np.sort(low), middles) - np.searchsorted(np.sort(high), middles)

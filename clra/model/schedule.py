@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -39,6 +40,10 @@ _MEDIAN, _LARGEST = 0.1, 0.5
 # 135 x 160, half a turn of a parallel beam, ends at 0.3 pixel in u instead of 0.6. At half the
 # sandstone of above is still moved by 0.09 in the first, and spheres by 0.02.
 _SLOW, _SLOW_AT_HALF = 0.02, 0.05
+# And what slow modes may have left to go, extrapolated.
+_LEFT, _LEFT_AT_HALF, _LIMIT_SMALL = 0.01, 0.01, 8
+# Fewest pixels of a side that registration takes.
+_REGISTERS = 16
 
 
 @dataclass(frozen=True)
@@ -55,12 +60,15 @@ class Stage:
         The most iterations.
     tolerance : float
         As for `converged`.
+    slow : float
+        Root mean square that slow modes may have left to go [pixel].
     """
 
     level: int
     iterations: int | None
     limit: int
     tolerance: float = _MEDIAN
+    slow: float = math.inf
 
     def __str__(self) -> str:
         """Return the stage as it is written in a schedule."""
@@ -133,10 +141,15 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
         If the text is no schedule; the message says what one looks like.
     """
     if text == "auto":
-        stages = [Stage(_LEVELS["QR"], None, _LIMIT, _SLOW)]
-        if min(shape) // 8 >= _SMALLEST:
-            stages = [Stage(level, count, count) for level, count in _LARGE]
-        return *stages, Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF, _SLOW_AT_HALF)
+        smallest = min(shape) or _SMALLEST * 8
+        half = Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF, _SLOW_AT_HALF, _LEFT_AT_HALF)
+        if smallest // 8 >= _SMALLEST:
+            return *(Stage(level, count, count) for level, count in _LARGE), half
+        quarter = Stage(_LEVELS["QR"], None, _LIMIT, _SLOW, _LEFT)
+        half = replace(half, limit=_LIMIT_SMALL)
+        coarse = (Stage(_LEVELS["ER"], 6, 6), quarter, half)
+        fits = [stage for stage in coarse if smallest // stage.level >= _REGISTERS]
+        return tuple(fits) or (Stage(1, None, _LIMIT, _SLOW, _LEFT),)
     stages = []
     for part in str(text).upper().split("-"):
         match = _STAGE.fullmatch(part)

@@ -63,8 +63,9 @@ def align(
     estimate: Annotated[
         str,
         typer.Option(
-            metavar="shift|shift+scale|source",
-            help="What moves in a radiograph; source: what the source causes, with parallax.",
+            metavar="shift|shift+scale|source|rigid",
+            help="What is estimated in each view; source: what the source causes, with parallax; "
+            "rigid: translations and rotations of the sample (or shift+roll, shift+scale+roll).",
         ),
     ] = "shift+scale",
     gauge: Annotated[

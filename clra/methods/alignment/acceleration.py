@@ -89,8 +89,8 @@ class MotionSteps:
         self._lever = 0.25 * float(np.hypot(*shape))
 
     def step(self, here: Motion, there: Motion) -> Floats:
-        """Return the plain step in u and v, (2, views) [pixel]."""
-        return (self._as_lengths(there) - self._as_lengths(here))[:2]
+        """Return the plain step in u, v and, if estimated, scale, (2 or 3, views) [pixel]."""
+        return self._as_lengths(there) - self._as_lengths(here)
 
     def next(self, here: Motion, there: Motion, *, plain: bool) -> Motion:
         """Return the next motion.

@@ -21,9 +21,11 @@ from clra.methods.alignment.acceleration import MotionSteps
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import Rejections
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
+from clra.methods.alignment.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     history_from,
@@ -34,7 +36,6 @@ from clra.methods.execution.packing import (
     registered_from,
 )
 from clra.model.gauge.gauge import Gauge, sample_points
-from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import Stage, converged, level_name, update_size
@@ -55,8 +56,8 @@ class CoarseToFine:
         Device and memory budget.
     scan : Scan
         At full resolution.
-    grid : VolumeGrid
-        At full resolution, with the margin that views at the ends of a scan look through.
+    region : Region
+        Where to reconstruct, at full resolution.
     schedule : str
         As it was written, for the result.
     scale : bool
@@ -75,7 +76,7 @@ class CoarseToFine:
 
     stream: Stream
     scan: Scan
-    grid: VolumeGrid
+    region: Region
     schedule: str
     scale: bool
     anchor: bool
@@ -98,7 +99,7 @@ class CoarseToFine:
         excluded = () if self.scan.corrections is None else self.scan.corrections.excluded
         self.rejections = Rejections(self.scan.views, excluded)
         self.motion = self.start
-        points = sample_points(self.grid)
+        points = sample_points(self.region.sample)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
         # magnifications of several per cent.
@@ -127,14 +128,14 @@ class CoarseToFine:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        level = Level(self.stream, self.scan, self.grid, self.solver, stage.level)
+        level = Level(self.stream, self.scan, self.region, self.solver, stage.level)
         if not self.history:
             self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
         # that one, its first steps would go astray.
         steps = self.solver.acceleration()
         self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
-        previous = None
+        slow, previous = SlowSteps(), None
         for iteration in range(done + 1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
@@ -146,7 +147,8 @@ class CoarseToFine:
                 self.rejected, level.bias = self.rejected | wrong, None
                 found = self._iterate(level, title=of)
             step, note = self._move(found, stage.level)
-            update = np.abs(step)
+            update = np.abs(step[:2])
+            left = slow.left(step[:, ~self.rejected])
             self.history.append(
                 Iteration.of(
                     name,
@@ -161,8 +163,10 @@ class CoarseToFine:
             )
             # 6, 13: until converged, whatever becomes of views that are rejected
             update_u, update_v = update[:, ~self.rejected]
-            ended = stage.iterations is None and converged(
-                update_u, update_v, previous, stage.tolerance
+            ended = (
+                stage.iterations is None
+                and left < stage.slow
+                and converged(update_u, update_v, previous, stage.tolerance)
             )
             self._keep(index, stage.limit if ended else iteration)
             if ended:
@@ -191,16 +195,17 @@ class CoarseToFine:
     def _move(self, found: Registered, level: int) -> tuple[Floats, str]:
         """Algorithm 1, step 5: append what was found.
 
-        Returns the plain step in u and v, and what was warned of.
+        Returns the plain step as lengths, and what was warned of.
         """
         self.registered = found
         self.rejected = self.rejections.of(found.correlation)
+        there = self._held(self.motion.then(found.motion), found, level)
         self.found = self.rejections.settled(
-            self.motion, self.motion.then(found.motion), self.rejected, first=not self.history
+            self.motion, there, self.rejected, first=not self.history
         ).normalised()
         there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
         step = self.steps.step(self.motion, there)
-        valid_views = np.abs(step[:, ~self.rejected])
+        valid_views = np.abs(step[:2, ~self.rejected])
         if self.history:
             note = warned(false_shifts=false_shifts(*self.last, level, valid_views))
             self.fresh = bool(note)
@@ -212,6 +217,16 @@ class CoarseToFine:
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
         return step, note
+
+    def _held(self, motion: Motion, found: Registered, level: int) -> Motion:
+        """Pull magnifications to those expected, where registration did not."""
+        spread = self.solver.jitter(self.scan.geometry.binned(level).shape)
+        if not (self.scale and spread):
+            return motion
+        expected = np.log(self.start.magnification)
+        logarithm = np.log(motion.magnification) - expected
+        pulled = held(logarithm, found.sigma[:, 2], spread)
+        return replace(motion, magnification=np.exp(pulled + expected))
 
     def _keep(self, stage: int, done: int) -> None:
         """Keep what the iterations so far gave: `done` of a stage."""

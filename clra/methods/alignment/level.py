@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.region import Region
 from clra.methods.alignment.reprojection import Registered, binned_mask, reproject_and_register
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.grid import VolumeGrid
@@ -26,8 +27,8 @@ class Level:
         Device and memory budget.
     scan : Scan
         At full resolution.
-    grid : VolumeGrid
-        At full resolution.
+    region : Region
+        Where to reconstruct, at full resolution.
     solver : Solver
         Estimator, and parts of the iteration.
     factor : int
@@ -37,23 +38,26 @@ class Level:
     ----------
     radiographs : Radiographs
         Binned.
+    grid : VolumeGrid
+        Of the level.
     bias : Motion or None
         What registration finds where nothing moved, once it is known.
     """
 
     stream: Stream
     scan: Scan
-    grid: VolumeGrid
+    region: Region
     solver: Solver
     factor: int
     radiographs: Radiographs = field(init=False)
+    grid: VolumeGrid = field(init=False)
     bias: Motion | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         # 1, 7: down-sample the measured radiographs
         self.radiographs = Radiographs(self.stream, self.scan, self.factor)
-        if self.factor > 1:
-            self.grid = self.grid.binned(self.factor)
+        grid = self.region.grid
+        self.grid = grid.binned(self.factor) if self.factor > 1 else grid
 
     def residual_motion(
         self,
@@ -95,9 +99,10 @@ class Level:
                 geometry,
                 self.grid,
                 positive=self.solver.positive,
-                terms=self.solver.terms,
+                terms=self.region.terms(self.solver.terms),
                 valid_views=valid_views,
-                circle=self.solver.circle,
+                circle=self.solver.circle and not self.region.truncated,
+                beside=self.region.truncated,
                 used=self.used,
                 stage=title if doing is None else f"{title}: {doing}",
             )

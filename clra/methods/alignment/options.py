@@ -7,7 +7,7 @@ import numpy as np
 
 from clra.errors import InputError
 from clra.methods.alignment.acceleration import Anderson
-from clra.methods.alignment.reprojection import SPREAD, registration_for
+from clra.methods.alignment.reprojection import SPREAD, is_large, registration_for
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan
@@ -104,8 +104,16 @@ class Solver:
             radiographs,
             first=first,
             magnification=magnification,
-            spread=self.spread,
+            spread=0.0 if self.jitter(radiographs.shape[1:]) else self.spread,
         )
+
+    def jitter(self, shape: tuple[int, ...]) -> float:
+        """Spread of magnifications that have to be pulled after registering (rows, columns).
+
+        0 where registration does so in each view: small images cannot tell even a slow drift, and
+        leave it for the next level.
+        """
+        return self.spread if is_large((shape[0], shape[1])) else 0.0
 
     def is_biased(self, geometry: ConeBeamGeometry) -> bool:
         """Whether what is found with radiographs of this geometry has to be corrected.

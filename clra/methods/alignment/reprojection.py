@@ -139,6 +139,11 @@ def band_of(shape: tuple[int, int], *, first: bool = False) -> tuple[float, floa
     return _FIRST_BAND if first else _BAND if _size(shape) == 1 else _SMALL_BAND
 
 
+def is_large(shape: tuple[int, int]) -> bool:
+    """Whether images of (rows, columns) tell magnifications as far as they are expected."""
+    return _size(shape) == 1
+
+
 def _size(shape: tuple[int, int]) -> float:
     """Diagonal as a part of what is long enough, at most 1."""
     return min(1.0, float(np.hypot(*shape)) / _LONG)

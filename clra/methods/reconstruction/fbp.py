@@ -1,6 +1,7 @@
 """Ramp-filtered back-projection for any trajectory, streamed."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,11 @@ from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import PlaneWriter, Volume
 
+# Width of the detector, in detectors, by whose views voxels beside the field of view of a truncated
+# sample are divided: by those alone that show them they would come out too strong, and corrections
+# overshoot. A sample 1.2 times as wide as the field ended at 0.58 pixel in u instead of 0.24.
+_WIDE = 3
+
 
 def ramp_fbp(
     stream: Stream,
@@ -36,6 +42,7 @@ def ramp_fbp(
     positive: bool = False,
     window: str = "ram-lak",
     extend: float | None = None,
+    beside: bool = False,
     planes: slice | None = None,
     target: PlaneWriter | None = None,
     onto: Volume | None = None,
@@ -76,6 +83,9 @@ def ramp_fbp(
     extend : float, optional
         Part of the columns by which rows are continued past the detector; by default as far as the
         sample seems to reach, see :func:`clra.methods.truncation.extension`.
+    beside : bool
+        Divide voxels beside the field of view by all views that would show them on a wider
+        detector.
     planes : slice, optional
         Planes of the grid that are wanted, all by default; the volume is then on their grid.
     target : PlaneWriter, optional
@@ -114,9 +124,12 @@ def ramp_fbp(
     filtered_bytes = 4 * math.prod(ramp.geometry.shape)
     wanted = slice(0, grid.shape[0]) if planes is None else planes
     near = around(wanted, grid.shape[0])
+    counted = geometry.subset(chosen)
+    if beside and rays is None:
+        counted = replace(counted, shape=(geometry.rows, _WIDE * geometry.columns))
     coverage = Coverage(
         context,
-        geometry.subset(chosen),
+        counted,
         grid.slab(near.start, near.stop),
         row_weight,
         view_weight=weight[chosen],

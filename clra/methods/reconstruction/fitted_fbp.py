@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.streaming.memory import Store
@@ -32,6 +33,7 @@ def fitted_fbp(
     used: NDArray[np.bool_],
     valid_views: NDArray[np.bool_],
     circle: bool,
+    beside: bool = False,
     stage: str,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection, and correct by what the radiographs lack.
@@ -59,7 +61,7 @@ def fitted_fbp(
         Corrections, 0 for plain filtered back-projection.
     used : ndarray of bool, (rows, columns)
         Pixels that count in the corrections.
-    valid_views, circle
+    valid_views, circle, beside
         As for :func:`clra.methods.reconstruction.fbp.ramp_fbp`.
     stage : str
         What progress reports call this.
@@ -71,6 +73,7 @@ def fitted_fbp(
     """
     terms = terms if positive else 0
     volumes = VOLUMES if terms else 1
+    reach = extension(radiographs, geometry, valid_views)
 
     def reconstructed(measured: Radiographs, onto: Volume | None, doing: str) -> Volume:
         return ramp_fbp(
@@ -80,6 +83,8 @@ def fitted_fbp(
             grid,
             valid_views=valid_views,
             circle=circle,
+            beside=beside,
+            extend=reach,
             positive=positive and onto is None,
             window="ram-lak" if onto is None else _WINDOW,
             volumes=volumes,

@@ -185,7 +185,7 @@ STEPS = ["reconstructing", "registering"]
 
 def test_progress_names_stage_and_counts(moved):
     seen = []
-    clra.align(moved.subset(slice(0, 40)), schedule="1QR", progress=seen.append)
+    clra.align(moved.subset(slice(0, 40)), schedule="1QR", progress=seen.append, quality=False)
     stages = list(dict.fromkeys(entry.stage for entry in seen))
     steps = [stage.rpartition(": ")[2] for stage in stages]
     displacement = ["simulating", "sharpening", *(f"{step} what is simulated" for step in STEPS)]

@@ -11,8 +11,10 @@ from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from clra.methods.alignment.reprojection import (
+    band_of,
     registration_for,
     reproject_and_register,
     with_margin,
@@ -27,13 +29,15 @@ from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 
-# Updates of the volume, all subsets of all passes. At half of it the residual of a perfect motion
-# is a fifth larger, at twice a tenth smaller.
-_UPDATES = 12
+# Updates of the volume, all subsets of all passes.
+_UPDATES = 9
 # Parts of the views, each predicted from the others: of few views a half is too few to go by.
 _FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
 # Photons that weigh the rays against each other: nearly alike.
 _PHOTONS = 1e3
+# Part of the largest line integral that is left at a border if the sample reaches beyond, and views
+# that tell.
+_AT_BORDER, _LOOKED_AT = 0.03, 24
 # Columns and views of what is looked at, at most: a few seconds whatever the size of the scan.
 _COLUMNS, _VIEWS = 80, 720
 
@@ -50,12 +54,15 @@ class Predicted:
     shift : ndarray, (views, 3)
         What registration with the prediction finds to be left: shift_u, shift_v [pixel of the
         full-resolution detector] and log(magnification); 0 where it is not registered.
+    slope : ndarray, (views,)
+        Residual that a shift of one pixel of the full-resolution detector would cause.
     sharpness : float
         Mean squared gradient of the volumes.
     """
 
     residual: Floats
     shift: Floats
+    slope: Floats
     sharpness: float
 
 
@@ -132,6 +139,7 @@ class HeldOut:
         parts = _PARTS_OF_FEW if len(views) < _FEW else _PARTS
         residual = np.full(self.scan.views, np.nan)
         shift = np.full((self.scan.views, 3), np.nan)
+        slope = np.full(self.scan.views, np.nan)
         sharpness = []
         for part in range(parts if whole else 1):
             held, train = index[part::parts], np.delete(index, np.s_[part::parts])
@@ -164,12 +172,30 @@ class HeldOut:
                 for where_it_lies in (True, False)
             )
             residual[views[held]] = np.sqrt(1 - np.clip(still.correlation, 0, 1) ** 2)
+            for view, image in zip(views[held], hidden.read(slice(0, len(held))), strict=True):
+                slope[view] = _slope(image) / level
             found = moved.motion
             shift[views[held]] = np.stack(
                 [level * found.shift_u, level * found.shift_v, np.log(found.magnification)], axis=1
             )
             sharpness.append(_gradient(volume.to_host()))
-        return Predicted(residual, shift, float(np.mean(sharpness)))
+        return Predicted(residual, shift, slope, float(np.mean(sharpness)))
+
+
+def is_cut_off(radiographs: Radiographs) -> bool:
+    """Whether the sample reaches beyond the sides of the detector in most of the radiographs."""
+    views = range(0, radiographs.shape[0], max(1, radiographs.shape[0] // _LOOKED_AT))
+    means = np.array([radiographs.read(slice(k, k + 1))[0].mean(axis=0) for k in views])
+    return bool(np.median(means[:, [0, -1]].max(axis=1)) > _AT_BORDER * means.max())
+
+
+def _slope(image: NDArray[np.float32]) -> float:
+    """RMS slope of a radiograph along rows and columns, relative to its own, in the band used."""
+    low, high = band_of((image.shape[0], image.shape[1]))
+    band = gaussian_filter(image.astype(np.float64), low) - gaussian_filter(image, high)
+    slopes = np.gradient(band)
+    power = float(np.mean(band**2))
+    return float(np.sqrt(0.5 * np.mean(slopes[0] ** 2 + slopes[1] ** 2) / power)) if power else 0.0
 
 
 def _gradient(volume: NDArray[np.float32]) -> float:
