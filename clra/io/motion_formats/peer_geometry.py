@@ -43,7 +43,7 @@ def with_one_pixel(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
 
 
 def cil_arrays(geometry: ConeBeamGeometry) -> dict[str, Any]:
-    """Return the arguments of CIL's ``AcquisitionGeometry.create_Cone3D_SOUV`` and what its detector is set to.
+    """Return what CIL's ``AcquisitionGeometry.create_Cone3D_SOUV`` and its detector are given.
 
     Parameters
     ----------
