@@ -17,10 +17,9 @@ from clra.methods.alignment.reprojection import (
     band_of,
     registration_for,
     reproject_and_register,
-    with_margin,
 )
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
-from clra.model.grid import default_grid
+from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.subsets import ordered_subsets
@@ -35,9 +34,6 @@ _UPDATES = 9
 _FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
 # Photons that weigh the rays against each other: nearly alike.
 _PHOTONS = 1e3
-# Part of the largest line integral that is left at a border if the sample reaches beyond, and views
-# that tell.
-_AT_BORDER, _LOOKED_AT = 0.03, 24
 # Columns and views of what is looked at, at most: a few seconds whatever the size of the scan.
 _COLUMNS, _VIEWS = 80, 720
 
@@ -76,10 +72,13 @@ class HeldOut:
         Device and memory budget.
     scan : Scan
         At full resolution.
+    grid : VolumeGrid
+        At full resolution: of all that the radiographs show.
     """
 
     stream: Stream
     scan: Scan
+    grid: VolumeGrid
 
     @property
     def level(self) -> int:
@@ -131,8 +130,7 @@ class HeldOut:
             What progress reports begin with.
         """
         level, scan = self.level, self.scan.subset(views)
-        full = with_margin(default_grid(scan.geometry))
-        grid = full.binned(level) if level > 1 else full
+        grid = self.grid.binned(level) if level > 1 else self.grid
         geometry = scan.geometry.with_motion(motion.subset(views)).binned(level)
         binned = Scan(radiographs, geometry)
         index = np.arange(len(views))
@@ -180,13 +178,6 @@ class HeldOut:
             )
             sharpness.append(_gradient(volume.to_host()))
         return Predicted(residual, shift, slope, float(np.mean(sharpness)))
-
-
-def is_cut_off(radiographs: Radiographs) -> bool:
-    """Whether the sample reaches beyond the sides of the detector in most of the radiographs."""
-    views = range(0, radiographs.shape[0], max(1, radiographs.shape[0] // _LOOKED_AT))
-    means = np.array([radiographs.read(slice(k, k + 1))[0].mean(axis=0) for k in views])
-    return bool(np.median(means[:, [0, -1]].max(axis=1)) > _AT_BORDER * means.max())
 
 
 def _slope(image: NDArray[np.float32]) -> float:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from clra.findings import Finding
+from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentResult
-from clra.methods.assessment.held_out import HeldOut, Predicted, is_cut_off
+from clra.methods.assessment.held_out import HeldOut, Predicted
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan
-from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -138,7 +138,8 @@ def assess(
         With its quality, and with standard errors that count what held-out views find to be left;
         with the start as its motion if the one that was found predicts them no better.
     """
-    held_out = HeldOut(stream, scan)
+    region = region_of(stream, scan, default_grid(scan.geometry))
+    held_out = HeldOut(stream, scan, region.grid)
     radiographs, views = held_out.radiographs(aligned.valid_views)
 
     def predicted(motion: Motion, whole: bool, name: str) -> Predicted:
@@ -155,7 +156,7 @@ def assess(
         aligned = replace(aligned, motion=start)
         after = predicted(start, True, "start")
     left = gauge.of(after)
-    unseen = _unseen(scan, radiographs) * min(1.0, np.sqrt(len(views) / _MANY))
+    unseen = _unseen(scan, region.truncated) * min(1.0, np.sqrt(len(views) / _MANY))
     sigma = _standard_errors(aligned, left, after, unseen)
     error = float(_MEAN * np.nanmean(sigma[:, :2], axis=0).max())
     quality = Quality(
@@ -255,9 +256,9 @@ def _moved(motion: Motion, start: Motion) -> bool:
     return motion != start
 
 
-def _unseen(scan: Scan, radiographs: Radiographs) -> float:
+def _unseen(scan: Scan, truncated: bool) -> float:
     """How many times what is seen of them errors are."""
-    if is_cut_off(radiographs):
+    if truncated:
         return _UNSEEN_OF_CUT_OFF
     whole = covered(scan.geometry) > 2 * np.pi - 1e-6
     return _UNSEEN if whole else _UNSEEN_ON_ARCS
