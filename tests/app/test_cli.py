@@ -107,7 +107,7 @@ def test_bad_input_is_refused_before_work(clra, scan_file, motion_file, tmp_path
     volume = tmp_path / "v.h5"
     refused(clra("info", tmp_path / "none.nxs"), 2, "none.nxs")
     refused(clra("info", motion_file), 2, motion_file)
-    for suffix in ("zarr", "mha"):
+    for suffix in ("jpg", "txt"):
         refused(clra("reconstruct", scan_file, "-o", tmp_path / f"v.{suffix}"), 2, suffix, ".h5")
     refused(
         clra("reconstruct", scan_file, "-o", volume, "--motion", motion_file, "--align"),
