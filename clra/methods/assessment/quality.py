@@ -158,7 +158,10 @@ def assess(
     left = gauge.of(after)
     unseen = _unseen(scan, region.truncated) * min(1.0, np.sqrt(len(views) / _MANY))
     sigma = _standard_errors(aligned, left, after, unseen)
-    error = float(_MEAN * np.nanmean(sigma[:, :2], axis=0).max())
+    # Phase correlation knows no standard errors.
+    known = np.isfinite(sigma[:, :2]).all(axis=1)
+    spread = sigma[known, :2].mean(axis=0) if known.any() else np.array(_rms(left)[:2])
+    error = float(_MEAN * spread.max())
     quality = Quality(
         verdict="good",
         level=held_out.level,
