@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.io.scanners.scanner_options import ScannerOptions as ScannerOptions
     from clra.io.volumes.volume_files import write_volume as write_volume
     from clra.methods.alignment.align import align as align
+    from clra.methods.alignment.alignment_step import AlignmentStep as AlignmentStep
     from clra.methods.alignment.result import AlignmentResult as AlignmentResult
     from clra.methods.correction import correct as correct
     from clra.methods.reconstruction.iterative import Multigrid as Multigrid
@@ -37,7 +38,6 @@ if TYPE_CHECKING:  # the same for type checkers, which do not follow the table
     from clra.model.trajectory import double_helix as double_helix
     from clra.model.trajectory import helix as helix
     from clra.model.trajectory import space_filling as space_filling
-    from clra.ops.alignment_step import AlignmentStep as AlignmentStep
     from clra.ops.projection.linear_operator import as_linear_operator as as_linear_operator
     from clra.ops.projection.projector import BackProjector as BackProjector
     from clra.ops.projection.projector import ForwardProjector as ForwardProjector
@@ -69,7 +69,7 @@ _HOMES = {
     "devices": "clra.ops.runtime.devices",
     "ForwardProjector": "clra.ops.projection.projector",
     "BackProjector": "clra.ops.projection.projector",
-    "AlignmentStep": "clra.ops.alignment_step",
+    "AlignmentStep": "clra.methods.alignment.alignment_step",
     "Finding": "clra.findings",
     "Progress": "clra.progress",
     "InputError": "clra.errors",

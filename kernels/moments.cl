@@ -6,10 +6,11 @@
 
 #define MOMENT
 
+#include "group.clh"
 #include "rays.clh"
 
 // Global size (rows, columns, count), rounded up at will.
-kernel void moment_rays(
+kernel required_group void moment_rays(
     global float *restrict projections, // (count, rows, columns)
     const ulong projections_offset,
     global float *restrict over_depth, // (count, rows, columns)

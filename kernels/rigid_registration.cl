@@ -14,6 +14,8 @@
 // A view is VIEW_NUMBERS numbers: a0, b0; |r|^2 as the six coefficients of 1, a, b, a^2, b^2, a b; and for
 // each of the six parameters y_u, y_v, y_r, then the coefficients of 1, a, b of w . u, w . v and w . r.
 
+#include "group.clh"
+
 #define PARAMETERS 6
 #define PER_PARAMETER 12
 #define VIEW_NUMBERS (8 + PARAMETERS * PER_PARAMETER)
@@ -47,7 +49,7 @@ static inline float central(const float before2, const float before, const float
 }
 
 // Global size (columns, rows, count), rounded up at will.
-kernel void rigid_derivatives(
+kernel required_group void rigid_derivatives(
     global float *restrict images, // (count, IMAGES, rows, columns)
     const ulong images_offset,
     global const float *restrict measured, // (count, rows, columns), line integrals
@@ -99,7 +101,7 @@ kernel void rigid_derivatives(
 // the rows, each taking every STRANDS-th column from its own on: neighbours read neighbours.
 //
 // Global size (STRANDS, blocks, count), rounded up at will.
-kernel void rigid_products(
+kernel required_group void rigid_products(
     global float *restrict sums, // (count, blocks, strands, PRODUCTS)
     const ulong sums_offset,
     global const float *restrict images, // (count, IMAGES, rows, columns)
@@ -171,7 +173,7 @@ kernel void rigid_products(
 }
 
 // Global size (PRODUCTS, count), rounded up at will.
-kernel void rigid_totals(
+kernel required_group void rigid_totals(
     global float *restrict totals, // (count, PRODUCTS)
     const ulong totals_offset,
     global const float *restrict sums, // (count, parts, PRODUCTS)

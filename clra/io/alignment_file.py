@@ -18,8 +18,8 @@ from clra.findings import Finding
 from clra.io.atomic import atomic_path
 from clra.io.damage import reads
 from clra.io.hdf5 import find, open_hdf5, require, text
-from clra.methods.alignment import quality as quality_module
 from clra.methods.alignment.result import AlignmentResult, Iteration, SupportsAsDict
+from clra.methods.assessment import quality as quality_module
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.findings import Finding
-from clra.methods.alignment.quality import Quality
 from clra.methods.alignment.reprojection import registration_for, reproject_and_register
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.quality import Quality
 from clra.methods.assessment.radiograph_checks import radiograph_findings
 from clra.methods.assessment.slice_sharpness import sharpening_by_opposite_rotation
 from clra.methods.reconstruction.fbp import ramp_fbp

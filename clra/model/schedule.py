@@ -40,10 +40,12 @@ _MEDIAN, _LARGEST = 0.1, 0.5
 # 135 x 160, half a turn of a parallel beam, ends at 0.3 pixel in u instead of 0.6. At half the
 # sandstone of above is still moved by 0.09 in the first, and spheres by 0.02.
 _SLOW, _SLOW_AT_HALF = 0.02, 0.05
-# And what slow modes may have left to go, extrapolated.
-_LEFT, _LEFT_AT_HALF, _LIMIT_SMALL = 0.01, 0.01, 8
-# Fewest pixels of a side that registration takes.
-_REGISTERS = 16
+# What slow modes may have left to go where they are waited for, extrapolated [pixel]; the most
+# iterations at half of the resolution where that costs little; and the fewest pixels of a side that
+# registration takes. Half a turn of a parallel beam takes 5, a circle 2 or 3.
+_LEFT, _LEFT_LARGE, _LIMIT_SMALL, _REGISTERS = 0.003, 0.02, 6, 16
+# Iterations of small detectors at an eighth, as far as there is one.
+_FIRST = 4
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,9 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
     ----------
     text : str
         Stages in order, such as "1QR-1HR", "2ER-2QR-1HR" or "4FR"; or "auto":
-        "6ER-3QR" for large detectors, for others quarter resolution until converged (at most 20
-        iterations), then half until converged (at most 3).
+        "6ER-3QR", then half of the resolution until converged (at most 3 iterations) for large
+        detectors; for others "4ER", a quarter until converged (at most 20), then half (at most 6),
+        without levels that are too small to be registered.
     shape : (int, int)
         Rows and columns of the detector, for "auto": large is from 384 on.
 
@@ -141,22 +144,24 @@ def parse_schedule(text: str, shape: tuple[int, int] = (0, 0)) -> tuple[Stage, .
         If the text is no schedule; the message says what one looks like.
     """
     if text == "auto":
-        smallest = min(shape) or _SMALLEST * 8
-        half = Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF, _SLOW_AT_HALF, _LEFT_AT_HALF)
+        smallest = min(shape) or 8 * _REGISTERS
+        half = Stage(_LEVELS["HR"], None, _LIMIT_AT_HALF, _SLOW_AT_HALF, _LEFT_LARGE)
         if smallest // 8 >= _SMALLEST:
             return *(Stage(level, count, count) for level, count in _LARGE), half
-        quarter = Stage(_LEVELS["QR"], None, _LIMIT, _SLOW, _LEFT)
-        half = replace(half, limit=_LIMIT_SMALL)
-        coarse = (Stage(_LEVELS["ER"], 6, 6), quarter, half)
-        fits = [stage for stage in coarse if smallest // stage.level >= _REGISTERS]
-        return tuple(fits) or (Stage(1, None, _LIMIT, _SLOW, _LEFT),)
-    stages = []
+        stages = (
+            Stage(_LEVELS["ER"], _FIRST, _FIRST),
+            Stage(_LEVELS["QR"], None, _LIMIT, _SLOW, _LEFT),
+            replace(half, limit=_LIMIT_SMALL, slow=_LEFT),
+        )
+        fits = tuple(stage for stage in stages if smallest // stage.level >= _REGISTERS)
+        return fits or (Stage(_LEVELS["FR"], None, _LIMIT, _SLOW, _LEFT),)
+    written = []
     for part in str(text).upper().split("-"):
         match = _STAGE.fullmatch(part)
         if match is None:
             raise InputError(f"schedule: found {text!r}, {_EXPECTED}")
-        stages.append(Stage(_LEVELS[match[2]], int(match[1]), int(match[1])))
-    return tuple(stages)
+        written.append(Stage(_LEVELS[match[2]], int(match[1]), int(match[1])))
+    return tuple(written)
 
 
 def update_size(update_u: ArrayLike, update_v: ArrayLike) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from clra.model.schedule import Stage, converged, level_name, parse_schedule, up
         ("2qr-12hr", [(4, 2, 2), (2, 12, 12)]),
         ("4FR", [(1, 4, 4)]),
         ("2ER-1QR-1HR-3FR", [(8, 2, 2), (4, 1, 1), (2, 1, 1), (1, 3, 3)]),
-        ("auto", [(4, None, 20, 0.02), (2, None, 3, 0.05)]),
+        ("auto", [(8, 4, 4), (4, None, 20, 0.02, 0.003), (2, None, 6, 0.05, 0.003)]),
     ],
 )
 def test_text_becomes_stages(text, stages):
@@ -24,6 +24,16 @@ def test_auto_begins_at_an_eighth_where_that_leaves_something():
     assert [str(stage) for stage in parse_schedule("auto", (928, 512))] == ["6ER", "3QR", "HR"]
     assert parse_schedule("auto", (928, 300)) == parse_schedule("auto")
     assert parse_schedule("1QR", (928, 512)) == parse_schedule("1QR")
+
+
+def test_auto_leaves_out_levels_too_small_to_be_registered():
+    for shape, stages in (
+        ((128, 130), ["4ER", "QR", "HR"]),
+        ((127, 500), ["QR", "HR"]),
+        ((63, 64), ["HR"]),
+        ((20, 31), ["FR"]),
+    ):
+        assert [str(stage) for stage in parse_schedule("auto", shape)] == stages
 
 
 @pytest.mark.parametrize(
@@ -37,7 +47,7 @@ def test_bad_text_says_what_a_schedule_looks_like(text):
 
 def test_stages_print_as_they_are_written():
     assert "-".join(str(stage) for stage in parse_schedule("2ER-1QR-3FR")) == "2ER-1QR-3FR"
-    assert [str(stage) for stage in parse_schedule("auto")] == ["QR", "HR"]
+    assert [str(stage) for stage in parse_schedule("auto")] == ["4ER", "QR", "HR"]
     assert [level_name(level) for level in (1, 2, 4, 8)] == ["FR", "HR", "QR", "ER"]
     with pytest.raises(ValueError, match="level: found 3"):
         level_name(3)

@@ -11,8 +11,8 @@ from clra.app.plausible import doubt_of_shifts
 from clra.app.progress_bar import duration
 from clra.app.scan_description import Facts, table, views_flagged
 from clra.findings import Finding
-from clra.methods.alignment.quality import Quality
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.quality import Quality
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion

@@ -1,8 +1,8 @@
 """What a report says first: whether the alignment is to be trusted, and why."""
 
 from clra.app.report import page
-from clra.methods.alignment.quality import Quality
 from clra.methods.alignment.result import SupportsAsDict
+from clra.methods.assessment.quality import Quality
 
 _WORDS = {
     "good": "Good: errors are most likely below 0.3 pixel",

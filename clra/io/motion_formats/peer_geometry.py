@@ -43,7 +43,7 @@ def with_one_pixel(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
 
 
 def cil_arrays(geometry: ConeBeamGeometry) -> dict[str, Any]:
-    """Return what CIL's ``AcquisitionGeometry.create_Cone3D_SOUV`` and its detector are given.
+    """Return the arguments of CIL's ``create_Cone3D_SOUV``, detector included.
 
     Parameters
     ----------

@@ -1,5 +1,6 @@
 """Where alignment reconstructs: what radiographs show of the sample, past what all of them see."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from clra.methods.alignment.reprojection import with_margin
 from clra.methods.truncation import AT_BORDER, falls_outwards, truncated
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, axis_ranges
+from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -16,8 +18,10 @@ from clra.ops.streaming.stream import Stream
 # radiographs and has to be in the re-projections. Motions of 30 pixels end at 0.074 pixel with 1,
 # 0.055 with this.
 _WIDER = 1.6
-# Corrections of the volume of a truncated sample: 1 ended at 0.24 pixel, 2 at 0.18, 4 at 0.14.
-_TERMS = 3
+# Corrections of the volume of a truncated sample: 1 ended at 0.24 pixel, 2 at 0.18, 4 at 0.14; and
+# of a short scan: 1 at 0.035, 2 at 0.025, 3 at 0.017. From less than half a turn, by this part,
+# noise and what no view sees grow instead.
+_TERMS, _HALF_TURN = 3, 0.95 * math.pi
 # What rays climb from the axis to the border of the field of view, in heights of the detector.
 _SLOPE = 0.1
 # Radiographs at each end of a scan that are looked at.
@@ -36,15 +40,18 @@ class Region:
         What a movement of the sample as a whole is judged by.
     truncated : bool
         Whether the sample reaches beyond the left or right border of the detector.
+    short : bool
+        Whether the views cover half a turn or more, but no whole one.
     """
 
     grid: VolumeGrid
     sample: VolumeGrid
     truncated: bool = False
+    short: bool = False
 
     def terms(self, usual: int) -> int:
         """Return how many corrections the volume needs where `usual` do for others."""
-        return max(usual, _TERMS) if self.truncated and usual else usual
+        return max(usual, _TERMS) if (self.truncated or self.short) and usual else usual
 
 
 def region_of(stream: Stream, scan: Scan, grid: VolumeGrid, *, own: bool = True) -> Region:
@@ -71,7 +78,8 @@ def region_of(stream: Stream, scan: Scan, grid: VolumeGrid, *, own: bool = True)
         wide = replace(sample, shape=(nz, round(_WIDER * ny), round(_WIDER * nx)))
     if own:
         wide = _as_high_as_seen(radiographs, scan.geometry, wide)
-    return Region(wide, sample, cut)
+    short = _HALF_TURN <= covered(scan.geometry) < 2 * math.pi
+    return Region(wide, sample, cut, short)
 
 
 def _as_high_as_seen(

@@ -133,7 +133,8 @@ def _clipped(images: list[NDArray[np.float32]]) -> list[Finding | None]:
                 measured={"part": float(dark), "value": highest},
             )
         )
-    if bright > _SATURATED and _noisy(stack[stack.shape[0] // 2], lowest + reach):
+    # Air is exactly 0 in simulations only.
+    if lowest != 0 and bright > _SATURATED and _noisy(stack[stack.shape[0] // 2], lowest + reach):
         found.append(
             Finding(
                 "clipped-detector",
@@ -181,8 +182,8 @@ def _truncation(columns: Floats, most: float, geometry: ConeBeamGeometry) -> Fin
                 "half-fan",
                 f"the axis is seen {abs(aside):.0f} columns beside the detector's middle, and the "
                 "sample is cut off at that side: a scan of half the fan",
-                "only the circle that all views see is reconstructed; scans of half the fan are "
-                "not supported",
+                "the sample is taken to reach as far at the other side; check the axis column "
+                "(--centre-offset) if it does not",
                 measured={"aside": aside},
             )
     if not cut > _AT_BORDER * most:

@@ -97,8 +97,7 @@ def reconstruct(
         the iterative methods return what their finished passes or levels gave, with a warning.
     checkpoint : path-like, optional
         Folder that keeps each finished pass of "osem-tr", level of "imgr" and iteration of an
-        alignment, so that an interruption of any kind loses none; removed at success. A
-        :class:`Checkpoint` is left to who made it.
+        alignment; removed at success. A :class:`Checkpoint` is left to who made it.
     resume : bool
         Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional

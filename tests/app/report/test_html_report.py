@@ -12,9 +12,9 @@ from clra.app.report.page import embedded
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
 from clra.findings import Finding
-from clra.methods.alignment.quality import Quality
 from clra.methods.alignment.result import AlignmentResult
 from clra.methods.assessment.agreement import Agreement
+from clra.methods.assessment.quality import Quality
 from clra.model.motion import Motion
 
 

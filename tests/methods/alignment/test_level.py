@@ -9,6 +9,7 @@ import pytest
 import clra
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.region import Region
 from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
@@ -44,7 +45,7 @@ def scan():
 
 
 def _found(scan, solver, memory=None):
-    level = Level(Stream(max_device_memory=memory), scan, GRID, solver, 2)
+    level = Level(Stream(max_device_memory=memory), scan, Region(GRID, GRID), solver, 2)
     options = {"valid_views": np.ones(VIEWS, np.bool_), "first": False, "magnification": True}
     options |= {"measure": True, "title": "test"}
     motion, still = Motion.identity(VIEWS), np.ones(VIEWS)

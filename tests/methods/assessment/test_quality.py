@@ -8,8 +8,8 @@ import pytest
 
 import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
-from clra.methods.alignment.quality import Quality, assess, judged
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.quality import Quality, assess, judged
 from clra.ops.streaming.stream import Stream
 
 VIEWS, SHAPE = 72, (48, 64)

@@ -8,6 +8,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
+from clra.methods.alignment.reprojection import band_of
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.sampling.ray_weights import ray_weights
@@ -45,7 +46,12 @@ class AlignmentStep:
         a tenth of the rows at the top and at the bottom, see :func:`clra.ops.filtering.ramp.taper`.
     volume_order : {"zyx", "yxz"}
         Axes of the volume. "yxz" is the kernels' own order and takes two scratch volumes less.
-    low_pass, high_pass, mask, magnification, spread
+    positive : bool
+        Raise negative attenuations to zero before the volume is projected, as :func:`clra.align`
+        does.
+    low_pass, high_pass : float, optional
+        Sigmas of the band-pass [pixel]; by default those of :func:`clra.align`.
+    mask, magnification, spread
         As :class:`clra.ops.registration.gauss_newton.Registration` takes them.
     allocator : callable, optional
         Gives the scratch memory, see :class:`clra.ops.runtime.buffers.Scratch`.
@@ -77,8 +83,9 @@ class AlignmentStep:
         *,
         row_weight: ArrayLike | None = None,
         volume_order: str = "zyx",
-        low_pass: float = 1.0,
-        high_pass: float = 16.0,
+        positive: bool = True,
+        low_pass: float | None = None,
+        high_pass: float | None = None,
         mask: ArrayLike | None = None,
         magnification: bool = True,
         spread: float = 0.0,
@@ -109,17 +116,19 @@ class AlignmentStep:
         self._forward = ForwardProjector(
             context, geometry, grid, volume_order=volume_order, **within_limits
         )
+        usual_low, usual_high = band_of(geometry.shape)
         self._registration = Registration(
             context,
             geometry.shape,
             views=views,
-            low_pass=low_pass,
-            high_pass=high_pass,
+            low_pass=usual_low if low_pass is None else low_pass,
+            high_pass=usual_high if high_pass is None else high_pass,
             mask=mask,
             magnification=magnification,
             spread=spread,
             **within_limits,
         )
+        self._lowest = 0.0 if positive else -math.inf
         self._volume_shape = volume_shape(grid, volume_order)
         operations = (
             self._ramp,
@@ -221,7 +230,12 @@ class AlignmentStep:
             )
         event = self._coverage.compute(queue, [event])
         return self._coverage.normalise(
-            queue, volume, self._scale, volume_order=self._order, wait_for=[event]
+            queue,
+            volume,
+            math.pi,
+            lowest=self._lowest,
+            volume_order=self._order,
+            wait_for=[event],
         )
 
     def _parts(self) -> list[slice]:
