@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from clra.errors import Cancelled
 from clra.findings import Finding
-from clra.methods.alignment.acceleration import MotionSteps
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
@@ -25,7 +24,8 @@ from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import Rejections
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
-from clra.methods.alignment.slow_modes import SlowSteps, held
+from clra.methods.alignment.steps.acceleration import MotionSteps
+from clra.methods.alignment.steps.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     history_from,
