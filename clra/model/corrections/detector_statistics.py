@@ -276,8 +276,8 @@ def _bands(shape: tuple[int, ...]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(edges)]
 
 
-def _ranked(values: Floats, step: tuple[int, int], distance: int) -> tuple[Floats, Floats, Floats]:
-    """Three lowest of the four neighbours on a line through each pixel; beyond borders mirrored."""
+def _ranked(values: Floats, step: tuple[int, int], distance: int) -> tuple[Floats, ...]:
+    """Sort the four neighbours on a line through each pixel; beyond borders they are mirrored."""
     reach = 2 * distance
     padded = np.pad(values, reach, mode="reflect" if min(values.shape) > reach else "symmetric")
     rows, columns = values.shape
@@ -293,6 +293,7 @@ def _ranked(values: Floats, step: tuple[int, int], distance: int) -> tuple[Float
         np.minimum(low, other_low),
         np.minimum(inner, other_inner),
         np.maximum(inner, other_inner),
+        np.maximum(high, other_high),
     )
 
 
@@ -301,10 +302,11 @@ def _excess(mean: Floats, step: tuple[int, int], distance: int) -> tuple[Floats,
 
     One of four neighbours on either side of their range does not count.
     """
-    _, second, third = _ranked(mean, step, distance)
+    first, second, third, fourth = _ranked(mean, step, distance)
     above, below = mean - third, second - mean
     side = np.sign(above - below)
-    return np.maximum(above, below), third - second, side
+    # Of three of them: two may be alike by chance, such as on either side of a round sample.
+    return np.maximum(above, below), np.minimum(fourth - second, third - first), side
 
 
 def _filled(values: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
