@@ -39,12 +39,23 @@ def once(step, queue, radiographs, shape=GRID.shape):
 
 def test_the_volume_is_the_sample(context, queue):
     still = ROCK.line_integrals(GEOMETRY)
-    estimates, volume = once(clra.AlignmentStep(context, GEOMETRY, GRID), queue, still)
+    step = clra.AlignmentStep(context, GEOMETRY, GRID, positive=False)
+    estimates, volume = once(step, queue, still)
     exact = ROCK.volume(GRID)
     inside = (slice(20, 31), slice(25, 40), slice(25, 40))
     assert volume[inside].mean() == pytest.approx(exact[inside].mean(), rel=INTENSITY)
     assert np.corrcoef(volume[inside].ravel(), exact[inside].ravel())[0, 1] > 0.9
     assert np.abs(estimates[:, :2]).mean() < STILL
+
+
+def test_the_volume_is_not_negative_unless_asked_for(context, queue):
+    still = ROCK.line_integrals(GEOMETRY)
+    volumes = [
+        once(clra.AlignmentStep(context, GEOMETRY, GRID, positive=positive), queue, still)[1]
+        for positive in (True, False)
+    ]
+    assert volumes[0].min() == 0 > volumes[1].min()
+    assert np.abs(volumes[0] - np.maximum(volumes[1], 0)).max() < ROUNDING * volumes[1].max()
 
 
 def test_repeated_it_finds_the_motion(context, queue, truth):
