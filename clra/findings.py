@@ -59,14 +59,22 @@ class Finding:
 
         Mere information is logged instead. Either goes to :func:`collected`.
         """
+        if self.severity == "info":
+            return self.record()
+        self._collect()
+        warnings.warn(str(self), ClraWarning, stacklevel=_callers_level())
+        return self
+
+    def record(self) -> Finding:
+        """Log it and hand it to :func:`collected`, for a result that tells it itself."""
+        self._collect()
+        _LOG.info("%s", self)
+        return self
+
+    def _collect(self) -> None:
         for findings in _COLLECTING.get():
             if self not in findings:
                 findings.append(self)
-        if self.severity == "info":
-            _LOG.info("%s", self)
-        else:
-            warnings.warn(str(self), ClraWarning, stacklevel=_callers_level())
-        return self
 
 
 def warn(code: str, message: str, advice: str = "") -> None:

@@ -66,6 +66,11 @@ kernel void forward_columns(
     float sum[BLOCK];
     for (int k = 0; k < BLOCK; ++k)
         sum[k] = 0.0f;
+#ifdef MOMENT
+    float moment[BLOCK];
+    for (int k = 0; k < BLOCK; ++k)
+        moment[k] = 0.0f;
+#endif
     for (int plane = first_plane; plane <= last_plane; ++plane) {
         const float q = fma(plane - start_p, slope_q, start_q);
         if (!(q > -1.0f && q < across))
@@ -93,7 +98,12 @@ kernel void forward_columns(
         if (fabs(slope) * (LANES - 1) > SPAN || nz < PIECE) {
             for (int k = start; k < stop; ++k) {
                 const float h = fma(slope, (float)k, z);
-                sum[k] += line_weight * tap(line, nz, h) + next_weight * tap(next, nz, h);
+                const float value =
+                    line_weight * tap(line, nz, h) + next_weight * tap(next, nz, h);
+                sum[k] += value;
+#ifdef MOMENT
+                moment[k] += value / t;
+#endif
             }
             continue;
         }
@@ -111,6 +121,9 @@ kernel void forward_columns(
                 value = between_zeros(both, whole_part(at) + (base - within), fraction(at));
             }
             store_lanes(load_lanes(sum + k) + value, sum + k);
+#ifdef MOMENT
+            store_lanes(load_lanes(moment + k) + value / t, moment + k);
+#endif
             step.lowest += step.advance;
         }
     }
@@ -121,5 +134,10 @@ kernel void forward_columns(
         const float climb = fma((float)k, rise_per_row, rise);
         const float integral = sum[k] * scale * sqrt(level + climb * climb);
         target[k] = from_plane > 0 ? target[k] + integral : integral;
+#ifdef MOMENT
+        global float *other = target + (size_t)count * (columns + 1) * pitch;
+        const float over_depth = moment[k] * scale * sqrt(level + climb * climb);
+        other[k] = from_plane > 0 ? other[k] + over_depth : over_depth;
+#endif
     }
 }

@@ -14,6 +14,9 @@
 // are those of rays (c, r) and on in q, the other one, and in z.
 static inline void add_planes(
     float *sum,
+#ifdef MOMENT
+    float *moment,
+#endif
     const float *slopes_q,
     const float *slopes_z,
     const scene s,
@@ -60,10 +63,15 @@ static inline void add_planes(
                 const float at_q = fma(t, slopes_q[k], start_q);
                 const float at_z = fma(t, slopes_z[k], start_z);
                 const int low = below(at_q);
+                float value = 0.0f;
                 if (low >= 0 && low < across)
-                    sum[k] += (1.0f - (at_q - low)) * tap(lines + low * stride_q, s.nz, at_z);
+                    value = (1.0f - (at_q - low)) * tap(lines + low * stride_q, s.nz, at_z);
                 if (low >= -1 && low + 1 < across)
-                    sum[k] += (at_q - low) * tap(lines + (low + 1) * stride_q, s.nz, at_z);
+                    value += (at_q - low) * tap(lines + (low + 1) * stride_q, s.nz, at_z);
+                sum[k] += value;
+#ifdef MOMENT
+                moment[k] += value / t;
+#endif
             }
             continue;
         }
@@ -145,6 +153,9 @@ static inline void add_planes(
                     value = WHERE((row >= first) & (row <= last), value);
                 }
                 store_lanes(load_lanes(sum + k) + value, sum + k);
+#ifdef MOMENT
+                store_lanes(load_lanes(moment + k) + value / t, moment + k);
+#endif
             }
         }
     }
@@ -187,6 +198,11 @@ kernel void forward_tilted(
     float sum[BLOCK], slopes_q[BLOCK], slopes_z[BLOCK];
     for (int k = 0; k < BLOCK; ++k)
         sum[k] = 0.0f;
+#ifdef MOMENT
+    float moment[BLOCK], advances[BLOCK];
+    for (int k = 0; k < BLOCK; ++k)
+        moment[k] = 0.0f;
+#endif
     for (int from = 0; from < pixels;) {
         const int axis = main_axis(s.view, c, r + from, 0);
         const int stop = from + rows_alike(s.view, axis, c, r + from, pixels - from);
@@ -198,23 +214,45 @@ kernel void forward_tilted(
                 const real y = ALONG(real, s.view, 1, c, row);
                 const real inverse = 1.0f / (axis ? y : x);
                 store_lanes((axis ? x : y) * inverse, slopes_q + k);
+#ifdef MOMENT
+                store_lanes(axis ? y : x, advances + k);
+#endif
                 store_lanes(ALONG(real, s.view, 2, c, row) * inverse, slopes_z + k);
             }
+#ifdef MOMENT
+            add_planes(sum, moment, slopes_q, slopes_z, s, c, r, from, stop, axis);
+#else
             add_planes(sum, slopes_q, slopes_z, s, c, r, from, stop, axis);
+#endif
             for (int k = from / LANES * LANES; k < stop; k += LANES) {
                 const real a = load_lanes(slopes_q + k);
                 const real b = load_lanes(slopes_z + k);
-                const real integral = load_lanes(sum + k) * voxel_size * sqrt(1.0f + a * a + b * b);
+                const real stretched = voxel_size * sqrt(1.0f + a * a + b * b);
                 const whole row = k + COUNT;
                 const whole mine = (row >= from) & (row < stop);
-                store_lanes(mine ? integral : load_lanes(sum + k), sum + k);
+                const real sampled = load_lanes(sum + k);
+                store_lanes(mine ? sampled * stretched : sampled, sum + k);
+#ifdef MOMENT
+                const real over_depth = load_lanes(moment + k);
+                store_lanes(
+                    mine ? over_depth * stretched * load_lanes(advances + k) : over_depth,
+                    moment + k);
+#endif
             }
         } else
-            for (int k = from; k < stop; ++k)
-                sum[k] = voxel_size * stretch(s, c, r + k, 2) * trace(s, c, r + k, 2);
+            for (int k = from; k < stop; ++k) {
+                const sums integral =
+                    voxel_size * stretch(s, c, r + k, 2) * trace(s, c, r + k, 2);
+                sum[k] = INTEGRAL(integral);
+#ifdef MOMENT
+                moment[k] = integral.s1;
+#endif
+            }
         from = stop;
     }
     global float *target = projections + ((size_t)view * (columns + 1) + c) * pitch + r;
-    for (int k = 0; k < pixels; ++k)
-        target[k] = from_plane > 0 ? target[k] + sum[k] : sum[k];
+    put(target, sum, pixels, from_plane > 0);
+#ifdef MOMENT
+    put(target + (size_t)count * (columns + 1) * pitch, moment, pixels, from_plane > 0);
+#endif
 }

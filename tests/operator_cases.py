@@ -18,9 +18,11 @@ from clra.ops.images.bandpass import Bandpass
 from clra.ops.images.pyramid import Prolong3D, Restrict2D, Restrict3D
 from clra.ops.images.warp import Warp
 from clra.ops.projection.coverage import Coverage
+from clra.ops.projection.moment_projector import MomentProjector
 from clra.ops.projection.pi_backprojector import PiBackProjector
 from clra.ops.registration.gauss_newton import Registration
 from clra.ops.registration.phase_correlation import PhaseCorrelation
+from clra.ops.registration.rigid_registration import RigidRegistration, rigid_table
 from clra.ops.statistics.poisson import RayStatistics, VolumeStep
 from clra.ops.streaming.multigrid import Residual
 
@@ -144,6 +146,16 @@ CASES = {
         GRID.shape,
         (values(*IMAGES),),
     ),
+    "moments": Case(
+        lambda c, **a: MomentProjector(c, GEOMETRY, GRID, **a),
+        IMAGES,
+        (values(*GRID.shape), values(*IMAGES)),
+        lambda operator: (
+            lambda queue, out, volume, over_depth, wait_for=None: operator(
+                queue, out, over_depth, volume, wait_for=wait_for
+            )
+        ),
+    ),
     "katsevich": Case(
         lambda c, **a: KatsevichFilter(c, HELIX, RADIUS, **a),
         (FILTERED.views, *FILTERED.shape),
@@ -187,6 +199,12 @@ CASES = {
         lambda c, **a: Registration(c, IMAGES[1:], views=3, high_pass=4.0, **a),
         (VIEWS, 10),
         PAIR,
+        closeness=REGISTERED,
+    ),
+    "rigid registration": Case(
+        lambda c, **a: RigidRegistration(c, IMAGES[1:], views=VIEWS, high_pass=4.0, **a),
+        (VIEWS, 36),
+        (*PAIR, values(*IMAGES), rigid_table(GEOMETRY)),
         closeness=REGISTERED,
     ),
     "residual": Case(

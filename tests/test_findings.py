@@ -42,8 +42,7 @@ def test_warnings_point_at_the_line_that_called() -> None:
 def test_a_result_carries_what_was_warned_of() -> None:
     with pytest.warns(ClraWarning) as told:
         result = clra.align(dark(), schedule="1FR")
-    serious = {str(finding) for finding in result.warnings if finding.severity != "info"}
-    assert serious == {str(warning.message) for warning in told}
+    assert {str(warning.message) for warning in told} <= set(map(str, result.warnings))
     assert "dark-pixels" in {finding.code for finding in result.warnings}
 
 

@@ -18,6 +18,7 @@ MOST_REGISTERS = 64
 # Kernels that may take more, and why they are faster so.
 MORE_REGISTERS = {
     "normal_equations": (128, "36 sums of a work-item stay in registers"),
+    "rigid_products": (104, "36 sums of a work-item stay in registers"),
     "adjoint_axial": (72, "16 voxels share what a column of rays costs"),
     "adjoint_leaning": (96, "8 voxels share what a column of rays costs"),
 }
@@ -37,12 +38,14 @@ GPU_FORMS: Mapping[str, tuple[int, Mapping[str, int]]] = {
     "ramp_transform.cl": (256, {"LENGTH": 4096, "GROUP": 256}),
     "forwardproject.cl": (256, {"RAYS": 4, "COLUMNS": 1024, "NX": 1024, "NZ": 1024}),
     "katsevich_filter.cl": (128, {"LANES": 2}),
+    "moments.cl": (256, {}),
     "multigrid.cl": (64, {}),
     "pi_backprojector.cl": (256, {"VOXELS": 8, "COLUMNS": 1024}),
     "pyramid.cl": (128, {"LANES": 2}),
     "gauss_newton.cl": (64, {}),
     "gauss_newton_sums.cl": (64, {"GROUP": 64}),
     "poisson.cl": (64, {}),
+    "rigid_registration.cl": (64, {"LANES": 1}),
     "transpose.cl": (256, {"LANES": 1}),
     "warp.cl": (128, {"LANES": 2}),
 }

@@ -22,7 +22,7 @@ TOOLS = Path(__file__).resolve().parent
 PAGE = TOOLS / "README.md"
 # Name of a table, and the tool with its arguments; FOLDER stands for a folder of the table's own.
 COMMANDS = {
-    "stress": "stress.py -o FOLDER",
+    "stress": "stress.py run --seeds 1 2 3 4 -o FOLDER",
     "figure3": "reproduce_figure3.py --scale 4 --schedules 1QR-1HR,2QR-2HR,auto -o FOLDER",
     "figure3-full": "reproduce_figure3.py --scale 1 --schedules 1QR-1HR,auto -o FOLDER",
     "ablation": "reproduce_figure3.py --scale 4 --ablation -o FOLDER",

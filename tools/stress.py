@@ -1,9 +1,9 @@
 """Stress benchmark: alignment of scans with anything wrong in them, against closed-form truths.
 
-``python tools/stress.py run -o STRESS`` aligns every kind of scan with the default options and
-writes STRESS.json, one entry a scan as soon as it is there, and STRESS.md; started again it goes on
-where it was stopped. ``--kinds 'circle*' tilt-3 --seeds 1 2 3 --size 128`` chooses. ``list`` tells
-the kinds.
+``python tools/stress.py run -o FOLDER`` aligns every kind of scan with the default options, writes
+FOLDER/stress.json, one entry a scan as soon as it is there, and FOLDER/stress.md, a line a scan,
+and prints a line a kind and what becomes of the verdicts; started again it goes on where it was
+stopped. ``--kinds 'circle*' tilt-3 --seeds 1 2 3 --size 128`` chooses. ``list`` tells the kinds.
 
 ``export KIND SEED FOLDER`` writes the same scan as files for other programs: scan.nx (NXtomo),
 radiographs.npy (line integrals), geometry.csv (source, detector centre, column step and row step of
@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stress_kinds import KINDS
 from stress_scans import Case
+from stress_table import by_kind, conclusions, table
 
 import clra
 from clra.model.gauge.gauge import Gauge
@@ -127,40 +128,6 @@ def _rank_correlation(a: Floats, b: Floats) -> float:
     return float(np.corrcoef(*ranks)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
 
 
-COLUMNS = (
-    ("kind", "kind", "{}"),
-    ("seed", "seed", "{}"),
-    ("still_error", "not aligned", "{:.3f}"),
-    ("free_u", "u", "{:.3f}"),
-    ("free_v", "v", "{:.3f}"),
-    ("free_m", "m", "{:.1e}"),
-    ("raw_u", "raw u", "{:.3f}"),
-    ("raw_v", "raw v", "{:.3f}"),
-    ("beyond", "beyond", "{:.2f}"),
-    ("ratio_u", "err/sigma u", "{:.2f}"),
-    ("ratio_v", "v", "{:.2f}"),
-    ("ratio_m", "m", "{:.2f}"),
-    ("verdict", "verdict", "{}"),
-    ("codes", "named", "{}"),
-    ("seconds", "CPU s", "{:.1f}"),
-)
-
-
-def table(entries: list[dict[str, Any]]) -> str:
-    """Return the results as a Markdown table."""
-    lines = ["| " + " | ".join(title for _, title, _ in COLUMNS) + " |"]
-    lines.append("|" + " --- |" * len(COLUMNS))
-    for entry in entries:
-        cells = []
-        for key, _, form in COLUMNS:
-            value = entry.get(key)
-            if key == "codes":
-                value = " ".join(value) if value else ("refused" if "refused" in entry else "")
-            cells.append("" if value is None else form.format(value))
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
 def _write(path: Path, text: str) -> None:
     """Replace a file in one step."""
     fresh = path.with_name(path.name + ".new")
@@ -170,7 +137,7 @@ def _write(path: Path, text: str) -> None:
 
 def run_all(arguments: argparse.Namespace) -> int:
     """Run what is chosen and is not there yet."""
-    store = Path(arguments.output).with_suffix(".json")
+    store = Path(arguments.output) / "stress.json"
     store.parent.mkdir(parents=True, exist_ok=True)
     entries = json.loads(store.read_text()) if store.exists() else []
     done = {(entry["kind"], entry["seed"], entry["size"]) for entry in entries}
@@ -181,8 +148,9 @@ def run_all(arguments: argparse.Namespace) -> int:
                 continue
             entries.append(run(name, seed, arguments.size, options))
             _write(store, json.dumps(entries, indent=1))
-            print(table(entries[-1:]).splitlines()[-1], flush=True)
+            print(table(entries[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
     _write(store.with_suffix(".md"), table(entries))
+    print(f"{by_kind(entries)}\n{conclusions(entries)}")
     return 0
 
 
@@ -233,7 +201,7 @@ def main(given: list[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="names of the kinds")
     running = commands.add_parser("run", help="align and measure")
-    running.add_argument("-o", "--output", default="stress.json", help="results, .json and .md")
+    running.add_argument("-o", "--output", default="stress", metavar="FOLDER")
     running.add_argument("--kinds", nargs="+", default=["*"], help="names, with * and ?")
     running.add_argument("--seeds", nargs="+", type=int, default=[1])
     running.add_argument("--options", default="{}", help="of clra.align, JSON")

@@ -246,7 +246,7 @@ _DEFECTS: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
     ("dead-columns", "dead_columns", 3.0, ("bad-pixels",)),
     ("hot-pixels", "hot_pixels", 0.005, ("bad-pixels",)),
     ("foreign-views", "foreign_views", 3.0, ("rejected-views",)),
-    ("beam-decay", "beam_decay", 0.3, ("beam-decay",)),
+    ("beam-decay", "beam_decay", 0.3, ("beam-decay", "intensity")),
     ("clipped", "clipped", 0.4, ("clipped-detector",)),
     ("saturated", "saturated", 0.7, ("clipped-detector",)),
     ("half-fan", "half_fan", 0.0, ("half-fan", "truncation")),

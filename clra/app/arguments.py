@@ -105,6 +105,55 @@ def pixel(text: str) -> float | tuple[float, float]:
     return sizes[0] if len(sizes) == 1 else (sizes[0], sizes[1])
 
 
+def view_numbers(option: str, text: str) -> tuple[int, ...]:
+    """Read a list of views: "3,17,40-52", both ends of a range included.
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        Numbers and ranges.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    views: set[int] = set()
+    for part in text.split(","):
+        found = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
+        first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+        if first > last:
+            raise InputError(f"{option}: found {text!r}, expected views such as 3,17,40-52")
+        views.update(range(first, last + 1))
+    return tuple(sorted(views))
+
+
+def coefficients(option: str, text: str) -> tuple[float, ...]:
+    """Read the coefficients of a polynomial: "0.02,0.001".
+
+    Parameters
+    ----------
+    option : str
+        Where it was given, for the message.
+    text : str
+        Numbers.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = (math.nan,)
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option}: found {text!r}, expected numbers such as 0.02,0.001")
+    return numbers
+
+
 def memory_size(option: str, text: str) -> int:
     """Read a number of bytes: "512M", "2.5G", "800MiB".
 

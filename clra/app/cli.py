@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from clra.app.commands.align import align
+from clra.app.commands.config import config
 from clra.app.commands.correct import correct
 from clra.app.commands.demo import demo
 from clra.app.commands.devices import devices
@@ -13,6 +14,7 @@ from clra.app.commands.import_scan import import_scan
 from clra.app.commands.info import info
 from clra.app.commands.reconstruct import reconstruct
 from clra.app.commands.report import report
+from clra.app.commands.run import run
 from clra.app.commands.simulate import simulate
 from clra.app.console import as_written, command
 from clra.app.exit_status import Group
@@ -36,6 +38,7 @@ Examples:
   clra info scan.nxs                               what a scan is and what it will take
   clra align scan.nxs -o motion.h5 --report report.html
   clra reconstruct scan.nxs --motion motion.h5 -o volume.h5
+  clra run scan.nxs -o results                     all of it in one go
 """
 
 
@@ -73,6 +76,8 @@ command(app, "reconstruct", writes=True)(reconstruct)
 command(app, "correct", writes=True)(correct)
 command(app, "report", writes=True)(report)
 command(app, "export-motion", writes=True)(export_motion)
+command(app, "run")(run)
+command(app, "config")(config)
 command(app, "demo")(demo)
 
 

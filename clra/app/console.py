@@ -6,8 +6,8 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
@@ -16,6 +16,9 @@ import numpy as np
 import typer
 
 from clra.app import progress_bar
+from clra.app.exit_status import command_line
+from clra.app.session.log_file import logged, result_logged, stages_logged
+from clra.app.session.session_options import Session
 from clra.errors import InputError
 from clra.findings import collected, collected_so_far
 
@@ -49,13 +52,16 @@ class Console:
         False
     )
 
-    def progress(self) -> AbstractContextManager["ProgressCallback"]:
-        """Show progress on stderr while a block runs, unless quiet."""
-        return progress_bar.shown(self.quiet)
+    @contextmanager
+    def progress(self) -> Iterator["ProgressCallback"]:
+        """Show progress on stderr while a block runs, unless quiet; and in the log."""
+        with progress_bar.shown(self.quiet) as report:
+            yield stages_logged(report)
 
     def result(self, values: Mapping[str, Any], text: str) -> None:
         """Print what a command was run for: JSON, or text for people."""
         print(to_json(values) if self.json else text)
+        result_logged(text)
 
     def summary(self, values: Mapping[str, Any], text: str) -> None:
         """Print what a command that wrote a file has to say of it, unless quiet.
@@ -288,19 +294,25 @@ def command(
                 own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
         if writes:
             shared += _options(Writing)
+        named = {parameter.name for parameter in own}
+        shared += [option for option in _options(Session) if option.name not in named]
 
         def run(**values: Any) -> None:
             for key, group in groups.items():
                 values[key] = group(**{f.name: values.pop(f.name) for f in fields(group)})
+            if "config" not in named:
+                del values["config"]  # its callback has read it
+            log = values.pop("log")
             if not writes:
-                with collected():
+                with logged(log, command_line()), collected():
                     function(**values)
                 return
             from clra.io.claims import one_run
 
             writing = Writing(**{f.name: values.pop(f.name) for f in fields(Writing)})
-            with one_run(overwrite=not writing.no_overwrite), collected():
-                function(**values)
+            with logged(log, command_line()), one_run(overwrite=not writing.no_overwrite):
+                with collected():
+                    function(**values)
 
         # typer learns a command's options from its signature and its annotations.
         run.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]

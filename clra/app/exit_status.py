@@ -36,6 +36,16 @@ def command_line() -> str:
     return _COMMAND.get()
 
 
+@contextmanager
+def as_command(words: Sequence[str]) -> Iterator[None]:
+    """Let :func:`command_line` tell another one within a block: a step of a longer command."""
+    token = _COMMAND.set(shlex.join(["clra", *words]))
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
+
+
 class InterruptedCommandError(Exception):
     """Ctrl-C; the message says what was kept.
 
@@ -59,7 +69,7 @@ def keeping(checkpoint: "Checkpoint") -> Iterator[None]:
             raise
         raise InterruptedCommandError(_goes_on(checkpoint)) from None
     except Exception as error:
-        if checkpoint.kept:
+        if checkpoint.kept and not isinstance(error, InterruptedCommandError):
             error.add_note(_goes_on(checkpoint))
         raise
 

@@ -10,7 +10,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 
 if TYPE_CHECKING:
-    from clra.methods.alignment.agreement import Agreement
+    from clra.methods.assessment.agreement import Agreement
 
 # Transmission that no sample causes, and the part of the pixels in which it may be all the same:
 # the rims of phase contrast are as bright, flats that fit badly are not.
@@ -30,8 +30,11 @@ def warn_of_scale(scan: Scan) -> None:
     if scan.kind != "transmission":
         return
     few = sorted({0, scan.views // 2, scan.views - 1})
-    pixels = np.concatenate([np.ravel(scan.projections[k : k + 1]) for k in few])
-    dark, bright = np.mean(pixels <= 0), np.mean(pixels > _BRIGHT)
+    pixels = np.concatenate([np.asarray(scan.projections[k : k + 1]) for k in few])
+    dark = np.mean(pixels <= 0)
+    # Hot pixels and columns, which are found later, stand alone.
+    is_bright = pixels > _BRIGHT
+    bright = np.mean(is_bright[:, :, 4:] & is_bright[:, :, 2:-2] & is_bright[:, :, :-4])
     if dark > 0.5:
         warn(
             "intensity-scale",

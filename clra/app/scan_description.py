@@ -134,6 +134,8 @@ class Facts:
         Field of view.
     motion_known, masked : bool
         Whether the scan carries its true motion, and a mask of pixels to use.
+    defects : tuple of str
+        What was found in its radiographs, if they were looked at.
     """
 
     name: str
@@ -153,6 +155,7 @@ class Facts:
     height_mm: float
     motion_known: bool
     masked: bool
+    defects: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, scan: Scan) -> "Facts":
@@ -183,6 +186,7 @@ class Facts:
             height_mm=nz * grid.voxel_size,
             motion_known=scan.truth is not None,
             masked=scan.mask is not None,
+            defects=() if scan.corrections is None else tuple(map(str, scan.corrections.findings)),
         )
 
     def lines(self) -> dict[str, str]:
@@ -219,6 +223,7 @@ class Facts:
             "volume": f"{nx} x {ny} x {nz} voxels of {metric(self.voxel_mm)}",
             "field of view": f"{metric(self.width_mm)} across, {metric(self.height_mm)} high",
             **({"known": " and ".join(known)} if known else {}),
+            **({"defects": "; ".join(self.defects)} if self.defects else {}),
         }
 
 

@@ -18,9 +18,10 @@ from clra.findings import Finding
 from clra.io.atomic import atomic_path
 from clra.io.damage import reads
 from clra.io.hdf5 import find, open_hdf5, require, text
-from clra.methods.alignment import quality as quality_module
 from clra.methods.alignment.result import AlignmentResult, Iteration, SupportsAsDict
+from clra.methods.assessment import quality as quality_module
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +36,16 @@ _FLAGGED = (
     "Views, counted from 0, whose registration is rejected: they have the motion that lies "
     "between their neighbours', and are best left out of a reconstruction."
 )
-_SIGMA = "Standard errors of shift_u, shift_v [pixel] and magnification, a row a view."
+_SIGMA = (
+    "Standard errors of shift_u, shift_v [pixel] and magnification, a row a view; of a rigid "
+    "motion those of the rotations [rad] follow."
+)
+_RIGID = (
+    "The sample moved by `translation` [mm] along, and turned by `rotation` [rad] about, the "
+    "view's u, v and beam axes, about the point at the depth of the rotation axis on the "
+    "perpendicular from the source to the detector. shift_u, shift_v and magnification are those "
+    "of a point there."
+)
 # What files of version 0.1.0 tell of the standard errors: their medians.
 _MEDIANS = ("sigma_u", "sigma_v", "sigma_magnification")
 # Fields of the result that are texts, and those that are kept as JSON.
@@ -78,6 +88,10 @@ def write_alignment(path: str | os.PathLike[str], result: AlignmentResult) -> No
         for name, unit in _UNITS.items():
             group[name] = getattr(result.motion, name)
             group[name].attrs["units"] = unit
+        if isinstance(result.motion, RigidMotion):
+            for name in ("translation", "rotation", "optics"):
+                group[name] = getattr(result.motion, name)
+            group.attrs["rigid"] = _RIGID
         group["confidence"] = result.confidence
         group["confidence"].attrs["units"] = "1"
         group["sigma"] = result.sigma
@@ -130,7 +144,7 @@ def read_alignment(path: str | os.PathLike[str]) -> AlignmentResult:
                 )
         confidence = columns.pop("confidence", None)
         try:
-            motion = Motion(**columns, cause=_cause(file["motion"]))
+            motion = _motion(file, columns)
         except ValueError as error:
             raise InputError(f"{os.fspath(path)}: /motion: {error}") from error
         attributes = {name: text(value) for name, value in file.attrs.items()}
@@ -152,6 +166,16 @@ def read_alignment(path: str | os.PathLike[str]) -> AlignmentResult:
             versions=_texts(plain["versions"]) or ({"clra": version} if version else {}),
             about=attributes,
         )
+
+
+def _motion(file: h5py.File, columns: dict[str, Floats]) -> Motion:
+    """Read a rigid motion where there is one, else shifts."""
+    group = file["motion"]
+    names = ("translation", "rotation", "optics")
+    if not all(isinstance(find(file, f"motion/{name}"), h5py.Dataset) for name in names):
+        return Motion(**columns, cause=_cause(group))
+    tables = {name: np.asarray(group[name][()], np.float64) for name in names}
+    return RigidMotion(**tables)
 
 
 def _column(dataset: h5py.Dataset) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import ScannerScan
 from clra.model.detector_pose import flipped, with_axis_at
 from clra.model.scan import Scan
+from clra.model.validation import all_but
 from clra.progress import ProgressCallback
 
 
@@ -107,6 +109,7 @@ def import_scanner(
     scan: ScannerScan,
     *,
     name: str | None = None,
+    exclude: Sequence[int] = (),
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write what a scanner's files hold as NXtomo; the file appears whole or not at all.
@@ -119,6 +122,8 @@ def import_scanner(
         Read some frames at a time.
     name : str, optional
         Title of the scan; the name of `out` if not given.
+    exclude : sequence of int
+        Radiographs that are marked as invalid, from 0: readers leave them out.
     progress : callable, optional
         Called with a ``Progress`` as frames are written.
 
@@ -143,6 +148,7 @@ def import_scanner(
         dtype=np.result_type(*(part.dtype for part in parts)),
         name=name or os.path.basename(os.fspath(out)),
         truth=scan.known_motion,
+        valid_views=all_but(exclude, scan.geometry.views),
         progress=progress,
         **others,
     )

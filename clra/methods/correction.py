@@ -60,6 +60,12 @@ def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
     """Do as :func:`correct`, errors included, on the device and within the memory of a stream."""
     if motion.views != scan.views:
         raise InputError(f"motion: found {motion.views} views, expected {scan.views}")
+    if motion.cause == "sample":
+        raise InputError(
+            "motion: found rotations of the sample, which no resampling of a radiograph undoes, "
+            "expected shifts; reconstruct with the alignment instead, or align with estimate "
+            "'shift'"
+        )
     if motion.cause == "source":
         Finding(
             "parallax",

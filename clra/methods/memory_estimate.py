@@ -9,6 +9,7 @@ from clra.methods.alignment.reprojection import band_of, with_margin
 from clra.methods.reconstruction.fitted_fbp import VOLUMES
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
+from clra.model.sampling.ray_weights import ray_weights, widened
 from clra.ops.projection.layout import view_shape
 from clra.ops.registration.gauss_newton import pair_bytes
 from clra.ops.runtime.lines import line_stride
@@ -72,6 +73,9 @@ def reconstruction_need(
     volumes : int
         How many volumes the device has to hold at a time.
     """
+    rays = ray_weights(geometry)
+    if rays is not None:  # filtered radiographs of an offset detector are wider
+        geometry = widened(geometry, *rays.beyond)
     views, (rows, columns), shared = geometry.views, geometry.shape, budgets.shared
     chunk = _chunk(budgets, geometry)
     padded = 4 * 2 * columns

@@ -15,6 +15,7 @@ from clra.model.corrections.corrections import Corrections
 from clra.model.corrections.detector_statistics import FEWEST, BadPixels, DetectorStatistics
 from clra.model.corrections.rings import ring_errors
 from clra.model.scan import Scan
+from clra.model.validation import all_but, checked_valid_views
 from clra.progress import ProgressCallback, tell
 
 # Views that the detector's pixels are judged by: 60 tell a hot pixel from photon noise, and of
@@ -51,7 +52,10 @@ def prepared(
     """
     options = options or CorrectionOptions()
     if scan.corrections is not None:
+        for finding in scan.corrections.findings:
+            finding.warn()
         return scan
+    all_but(options.exclude, scan.views)  # refuses what is wrong
     findings: list[Finding] = []
     bad = air = rings = None
     wanted = options.bad_pixels or options.intensity or options.rings
@@ -59,9 +63,10 @@ def prepared(
         statistics = DetectorStatistics(scan.geometry.shape)
         sides = AirStatistics(*scan.window)
         views = np.arange(scan.views) if options.rings else sample_of_views(scan)
+        views = np.setdiff1d(views, options.exclude)
         for done, view in enumerate(views):
             tell(progress, "looking for defects", done, len(views))
-            image = scan.read(int(view), int(view) + 1)[0]
+            image = scan.read(int(view), int(view) + 1, check=False)[0]
             statistics.add(image)
             sides.add(image)
         tell(progress, "looking for defects", len(views), len(views))
@@ -84,6 +89,8 @@ def prepared(
         air=air,
         rings=rings,
         beam_hardening=options.beam_hardening,
+        excluded=options.exclude,
+        findings=tuple(findings),
     )
     return replace(scan, corrections=corrections)
 
@@ -91,6 +98,15 @@ def prepared(
 def with_detector_of(scan: Scan, other: Scan) -> Scan:
     """Return another scan by the same detector with the scan's mask, bad pixels and rings."""
     return replace(other, mask=scan.mask, corrections=scan.corrections)
+
+
+def used_views(scan: Scan, valid: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Return which views to use, (views,): those that are valid and not excluded; None for all."""
+    excluded = () if scan.corrections is None else scan.corrections.excluded
+    left = all_but(excluded, scan.views)
+    if left is None or valid is None:
+        return valid if left is None else left
+    return checked_valid_views(valid & left, scan.views)
 
 
 def sample_of_views(scan: Scan) -> NDArray[np.intp]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
+from clra.model.rigid.rigid_motion import RigidMotion, absorb
 from clra.model.validation import detector_shape, same_views, selection, vectors, whole
 
 if TYPE_CHECKING:
@@ -179,13 +180,13 @@ class ConeBeamGeometry:
         InputError
             If it is of another number of views.
         """
+        if isinstance(motion, RigidMotion):
+            return ConeBeamGeometry(**absorb(self, motion), shape=self.shape)
         if motion.views != self.views:
             raise InputError(f"motion: found {motion.views} views, expected {self.views}")
         if motion.cause == "source":
             source = self.source + self.source_displacement(motion)
-            return ConeBeamGeometry(
-                source=source, detector=self.detector, u=self.u, v=self.v, shape=self.shape
-            )
+            return replace(self, source=source)
         u = self.u / motion.magnification[:, None]
         v = self.v / motion.magnification[:, None]
         detector = self.detector - motion.shift_u[:, None] * u - motion.shift_v[:, None] * v
@@ -255,13 +256,8 @@ class ConeBeamGeometry:
             Which views, in that order.
         """
         chosen = selection(index)
-        return ConeBeamGeometry(
-            source=self.source[chosen],
-            detector=self.detector[chosen],
-            u=self.u[chosen],
-            v=self.v[chosen],
-            shape=self.shape,
-        )
+        names = ("source", "detector", "u", "v")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def projection_matrices(self) -> Floats:
         """Return the matrices that project points to pixels.

@@ -12,7 +12,7 @@ from clra.model.validation import column, same_views, selection, whole
 
 Floats = NDArray[np.float64]
 
-CAUSES = ("detector", "source")
+CAUSES = ("detector", "source", "sample")
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -30,8 +30,9 @@ class Motion:
         Shift toward higher rows [pixel of the full-resolution detector].
     magnification : array_like, (views,), optional
         Above 1 where the radiograph appears larger; all 1 if not given.
-    cause : {"detector", "source"}
-        What moved: the radiograph in its plane, or the source. A source that moves shifts what is
+    cause : {"detector", "source", "sample"}
+        What moved: the radiograph in its plane, or the source, or the sample as a rigid body
+        (:class:`clra.model.rigid.rigid_motion.RigidMotion`). A source that moves shifts what is
         near it farther than what is far; the numbers above are then those of a point at the depth
         of the rotation axis.
 

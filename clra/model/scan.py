@@ -121,13 +121,15 @@ class Scan:
         """Summarise name, kind and geometry."""
         return f"Scan({self.name!r}, {self.kind}, {self.geometry!r})"
 
-    def read(self, start: int, stop: int) -> NDArray[np.float32]:
+    def read(self, start: int, stop: int, *, check: bool = True) -> NDArray[np.float32]:
         """Read the line integrals of the views `start` to `stop - 1`.
 
         Parameters
         ----------
         start, stop : int
             Range of views, 0 <= start <= stop <= views.
+        check : bool
+            Warn of radiographs of which much is too dark.
 
         Returns
         -------
@@ -146,7 +148,8 @@ class Scan:
             )
         pixels = np.ascontiguousarray(self.projections[start:stop], dtype=np.float32)
         if self.kind == "transmission":
-            self._warn_of_dark(pixels)
+            if check:
+                self._warn_of_dark(pixels)
             pixels = np.negative(np.log(np.maximum(pixels, np.float32(_DARKEST))))
         if self._all_corrections is not None:
             pixels = self._all_corrections.apply(pixels)
@@ -171,7 +174,10 @@ class Scan:
 
     def _warn_of_dark(self, transmission: NDArray[np.float32]) -> None:
         dark = transmission <= _DARKEST
-        part = (dark if self.mask is None else dark & self.mask).mean(axis=(1, 2))
+        known = self._all_corrections
+        if known is not None and known.bad is not None:
+            dark &= ~known.bad
+        part = dark.mean(axis=(1, 2))
         # A radiograph that is dark all over is no view of the sample, and found out elsewhere.
         if part[part < 0.5].max(initial=0) > _DARK:
             warn(

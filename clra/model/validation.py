@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -107,3 +108,35 @@ def _finite_array(name: str, array: Floats, each: str) -> Floats:
         )
     array.flags.writeable = False
     return array
+
+
+def all_but(exclude: Iterable[int], views: int) -> NDArray[np.bool_] | None:
+    """Return which views are left if some are excluded.
+
+    Parameters
+    ----------
+    exclude : iterable of int
+        Views, from 0.
+    views : int
+        Of the scan.
+
+    Returns
+    -------
+    ndarray of bool, (views,), or None
+        None if none is excluded.
+
+    Raises
+    ------
+    InputError
+        If there is no such view, or none is left.
+    """
+    given = set(exclude)
+    if not given:
+        return None
+    outside = [view for view in sorted(given) if not 0 <= view < views]
+    if outside or len(given) == views:
+        found = f"view {outside[0]}" if outside else "all views"
+        raise InputError(f"exclude: found {found}, expected some of {views} views, from 0")
+    valid = np.ones(views, np.bool_)
+    valid[list(given)] = False
+    return valid

@@ -3,13 +3,16 @@ from pathlib import Path
 import pytest
 
 from clra.app.arguments import (
+    coefficients,
     detector,
     interval,
     limits_of_integers,
     pixel,
     region,
+    view_numbers,
     volume_file,
 )
+from clra.errors import InputError
 from clra.io.volumes.integer_limits import Limits
 
 
@@ -52,3 +55,17 @@ def test_regions_may_leave_ends_open():
 def test_limits_are_values_or_percentiles():
     assert limits_of_integers("--limits", "-1,2") == Limits(-1, 2, False)
     assert limits_of_integers("--limits", "0.1%, 99%") == Limits(0.1, 99, True)
+
+
+def test_lists_of_views():
+    assert view_numbers("--exclude", "17, 3,40-42") == (3, 17, 40, 41, 42)
+    for text in ("", "3-", "5-3", "-1", "2;3", "a"):
+        with pytest.raises(InputError, match=r"--exclude: found .*, expected views such as"):
+            view_numbers("--exclude", text)
+
+
+def test_coefficients():
+    assert coefficients("--beam-hardening", "0.02,-1e-3") == (0.02, -0.001)
+    for text in ("", "x", "1,nan"):
+        with pytest.raises(InputError, match=r"--beam-hardening: found .*, expected numbers"):
+            coefficients("--beam-hardening", text)

@@ -84,7 +84,7 @@ def test_shifts_and_report(wood, tmp_path, clra):
     assert found["mae_u"] < MAE and found["mae_v"] < MAE
     text = page.read_text(encoding="utf-8")
     assert "reconstructed by Katsevich" in text
-    assert "mirrored about the dashed line" in text
+    assert "mirrored about the middle" in text
 
 
 @pytest.mark.parametrize("options", [[], ["--align"]])

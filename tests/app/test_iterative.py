@@ -151,7 +151,9 @@ def test_an_alignment_goes_on(clra, scan_file, tmp_path, monkeypatch):
     refused(done, 1, "too many voxels; ", folder, "keeps 1 iteration, the last at HR, --resume")
     assert not out.exists()
     stop(KeyboardInterrupt())
-    refused(clra(*command, "--resume"), 130, out, "keeps what 1 iteration", "--resume goes on")
+    done = clra(*command, "--resume")
+    refused(done, 130, out, "keeps what 1 iteration", "--resume goes on")
+    assert done[2].count("--resume") == 1
     assert len(read_alignment(out).history) == 1
     monkeypatch.undo()
     assert clra(*command, "--resume", "--quiet") == (0, "", "")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clra.app.plausible import doubt_of_shifts
-from clra.methods.alignment.agreement import Agreement
+from clra.methods.assessment.agreement import Agreement
 from clra.model.motion import Motion
 
 

@@ -247,8 +247,10 @@ def test_the_callers_pool_gives_the_scratch_memory(name, context, queue):
     first, second = (result(case, operator, queue) for _ in range(2))
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(first, result(case, case.make(context), queue))
-    assert 0 < sum(taken) <= operator.scratch_bytes
-    assert pool.active_blocks >= max(blocks, 1)
+    # On a GPU some need none.
+    assert (sum(taken) > 0) == (operator.scratch_bytes > 0)
+    assert sum(taken) <= operator.scratch_bytes
+    assert pool.active_blocks >= max(blocks, int(operator.scratch_bytes > 0))
     del operator
     assert pool.active_blocks == 0
 

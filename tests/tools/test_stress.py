@@ -79,15 +79,15 @@ def test_no_motion_mends_a_wrong_geometry(tool, stress, kind, least):
 def test_runs_and_goes_on(stress, tmp_path, capsys):
     given = ["run", "-o", str(tmp_path / "found"), "--kinds", "still-9", "--size", "96"]
     stress.main([*given, "--seeds", "1"])
-    first = json.loads((tmp_path / "found.json").read_text())
+    first = json.loads((tmp_path / "found" / "stress.json").read_text())
     assert [entry["seed"] for entry in first] == [1]
     assert first[0]["still_error"] == pytest.approx(0, abs=1e-9)
-    assert first[0]["error"] > 0
+    assert first[0]["error"] < 0.5 and first[0]["seconds"] > 0
     stress.main([*given, "--seeds", "1", "2"])
-    both = json.loads((tmp_path / "found.json").read_text())
+    both = json.loads((tmp_path / "found" / "stress.json").read_text())
     assert [entry["seed"] for entry in both] == [1, 2]
     assert both[0] == first[0]
-    assert (tmp_path / "found.md").read_text().count("\n") == 4
+    assert (tmp_path / "found" / "stress.md").read_text().count("\n") == 4
 
 
 def test_a_perfect_result_scores_nothing(tool, stress, tmp_path, capsys):
@@ -103,3 +103,23 @@ def test_a_perfect_result_scores_nothing(tool, stress, tmp_path, capsys):
     stress.main(["score", "circle", "3", str(tmp_path / "found.csv"), "--size", "48"])
     still = json.loads(capsys.readouterr().out)
     assert still["raw_u"] == pytest.approx(np.abs(case.truth.values[:, 0]).mean())
+
+
+def test_verdicts_are_added_up(tool):
+    right = {"kind": "a", "seed": 1, "causes": ["x"], "error": 0.05, "codes": [], "verdict": "good"}
+    wrong = {"kind": "b", "seed": 1, "causes": ["x"], "codes": ["y"], "verdict": "failed"}
+    more = {"ratio_u": 1.0, "rank_u": 0.6}
+    told = tool("stress_table").conclusions(
+        [
+            {**right, **more},
+            {**right, "verdict": "doubtful", "ratio_u": 3.0, "rank_u": 0.2},
+            wrong,
+            {**wrong, "codes": ["x"]},
+            {**wrong, "error": 0.7, "verdict": "good"},
+        ]
+    )
+    assert "Of 3 with an error above 0.5 pixel 2 are doubtful" in told
+    assert "the right cause is named in 1; of 2 with one below 0.15 pixel 1 are." in told
+    assert (
+        "in u: 2.00 (median), within 0.5 and 2 in 1 of 2; rank correlation of the two 0.40" in told
+    )

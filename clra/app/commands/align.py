@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
+from clra.app.correcting import Correcting
 from clra.errors import InputError
 
 
@@ -14,6 +15,7 @@ def align(
     console: Console,
     reading: Reading,
     memory: Memory,
+    correcting: Correcting,
     scan: ScanPath,
     out: Annotated[
         Path, typer.Option("--output", "-o", metavar="MOTION.h5", help="Motion to write.")
@@ -61,8 +63,9 @@ def align(
     estimate: Annotated[
         str,
         typer.Option(
-            metavar="shift|shift+scale|source",
-            help="What moves in a radiograph; source: what the source causes, with parallax.",
+            metavar="shift|shift+scale|source|rigid",
+            help="What is estimated in each view; source: what the source causes, with parallax; "
+            "rigid: translations and rotations of the sample (or shift+roll, shift+scale+roll).",
         ),
     ] = "shift+scale",
     gauge: Annotated[
@@ -111,6 +114,7 @@ def align(
     from clra.methods.alignment.autofocus import autofocus as find_focus
     from clra.methods.alignment.result import AlignmentInterrupted, finished
     from clra.methods.execution.checkpoint import Checkpoint
+    from clra.methods.preparation import prepared
     from clra.model.grid import default_grid
     from clra.model.schedule import parse_levels, parse_schedule
 
@@ -142,10 +146,12 @@ def align(
         f"--estimate {estimate} --gauge {gauge}"
         f"{'' if reference is None else f' --reference {reference}'}"
         f"{'' if start is None else f' --start {start}'}"
-        f"{' --autofocus' if autofocus else ''}{reading.as_typed()}",
+        f"{' --autofocus' if autofocus else ''}{reading.as_typed()}"
+        f"{correcting.as_typed()}",
     }
     checkpoint = Checkpoint(f"{out}.resume", resume=resume)
     with console.progress() as progress, keeping(checkpoint):
+        opened = prepared(opened, correcting.options(), progress=progress)
         if autofocus:
             focus = find_focus(opened, console.device, progress=progress, **limits)
             about |= focus_attributes(focus)

@@ -6,12 +6,14 @@ from typing import Annotated
 import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
+from clra.app.correcting import Correcting
 
 
 def correct(
     console: Console,
     reading: Reading,
     memory: Memory,
+    correcting: Correcting,
     scan: ScanPath,
     motion: Annotated[
         Path, typer.Option(metavar="MOTION.h5", help="Motion to correct, from clra align.")
@@ -38,6 +40,7 @@ def correct(
     from clra.io.provenance import provenance
     from clra.io.scan_files import write_scan
     from clra.methods.correction import correct as correct_scan
+    from clra.methods.preparation import prepared, used_views
 
     limits = memory.limits()
     opened = reading.scan(scan)
@@ -45,6 +48,8 @@ def correct(
     views, rows, columns = opened.shape
     ensure_writable(out, (scan, motion), 4 * views * rows * columns)
     with console.progress() as progress:
+        opened = prepared(opened, correcting.options(), progress=progress)
+        valid_views = used_views(opened, alignment.valid_views)
         corrected = correct_scan(opened, alignment.motion, console.device, **limits)
         made = provenance(
             command=command_line(), scan=opened, alignment=alignment, method="correct"
@@ -52,11 +57,11 @@ def correct(
         write_scan(
             out,
             corrected,
-            valid_views=alignment.valid_views,
+            valid_views=valid_views,
             provenance=made,
             progress=progress,
         )
-    invalid = alignment.flagged
+    invalid = () if valid_views is None else tuple((~valid_views).nonzero()[0].tolist())
     marked = f"\n{views_flagged(invalid)}; marked invalid, readers leave them out"
     console.summary(
         {"file": out, "shape": opened.shape, "invalid": invalid},

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from clra.app.arguments import axis_place, detector, pixel
+from clra.app.arguments import axis_place, detector, pixel, view_numbers
 from clra.app.console import Console
 from clra.errors import InputError
 from clra.findings import warn
@@ -115,6 +115,20 @@ def import_scan(
             help="A scanner's radiographs are stored mirrored against what its metadata say.",
         ),
     ] = None,
+    axis: Annotated[
+        str,
+        typer.Option(
+            metavar="vertical|horizontal",
+            help="How the rotation axis runs in the frames; of a horizontal one the right end "
+            "becomes the top.",
+        ),
+    ] = "vertical",
+    exclude: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VIEWS", help="Radiographs to mark as invalid, from 0, such as 3,17,40-52."
+        ),
+    ] = None,
     white: Annotated[
         float | None,
         typer.Option(metavar="COUNTS", help="Of the open beam, in place of a scanner's own."),
@@ -141,14 +155,15 @@ def import_scan(
     from clra.io.scanners.scanner_options import ScannerOptions
 
     size = None if pixel_size is None else pixel(pixel_size)
-    axis = None if centre_offset is None else axis_place("--centre-offset", centre_offset)
+    place = None if centre_offset is None else axis_place("--centre-offset", centre_offset)
+    excluded = () if exclude is None else view_numbers("--exclude", exclude)
     pixels = detector("--shape", shape) if shape else None
     scanner = None
     if len(frames) == 1 and (angles is None or recognise_or_none(Path(frames[0])) is not None):
         options = ScannerOptions(
             rotation=rotation,
             flip=flip,
-            centre_offset=axis,
+            centre_offset=place,
             source_distance=source_distance,
             detector_distance=detector_distance,
             pixel_size=size,
@@ -163,7 +178,9 @@ def import_scan(
         if flat or flat_after or dark:
             given = "--flat, --flat-after or --dark"
             raise InputError.at(scanner.path, given, "frames", "none: they come from the scan")
-        _import_scanner(console, scanner, out, flipped=flip is not None)
+        if axis != "vertical":
+            raise InputError.at(scanner.path, "--axis", axis, "vertical: it is for frames")
+        _import_scanner(console, scanner, out, excluded, flipped=flip is not None)
         return
     if angles is None or size is None:
         missing = "--angles" if angles is None else "--pixel-size"
@@ -190,8 +207,10 @@ def import_scan(
             byteorder=byteorder,
             header=header,
             z_translation=z_translation,
-            centre_offset=0.0 if axis is None else axis[0],
+            centre_offset=0.0 if place is None else place[0],
             rotation=rotation or "ccw",
+            axis=axis,
+            exclude=excluded,
             name=out.stem,
             progress=report,
         )
@@ -206,13 +225,20 @@ def import_scan(
         _warn_of_no_flats(out)
 
 
-def _import_scanner(console: Console, scanner: "ScannerScan", out: Path, *, flipped: bool) -> None:
+def _import_scanner(
+    console: Console,
+    scanner: "ScannerScan",
+    out: Path,
+    exclude: tuple[int, ...],
+    *,
+    flipped: bool,
+) -> None:
     """Write what a scanner's files hold, and tell what was read and assumed."""
     from clra.app.scan_description import Facts, scanner_text, table
     from clra.io.scan_files import import_scanner
 
     with console.progress() as report:
-        import_scanner(out, scanner, name=out.stem, progress=report)
+        import_scanner(out, scanner, name=out.stem, exclude=exclude, progress=report)
     facts = Facts.of(scanner.described())
     values = {
         "file": out,

@@ -1,15 +1,19 @@
 """Describe a scan and what it will take."""
 
 from clra.app.console import Console, Memory, Reading, ScanPath
+from clra.app.correcting import Correcting
 from clra.findings import warn
 
 
-def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> None:
+def info(
+    console: Console, reading: Reading, memory: Memory, correcting: Correcting, scan: ScanPath
+) -> None:
     """Describe a scan and what it will take.
 
     Memory and time of a reconstruction and of an iteration of alignment at each level of
-    resolution, estimated from a small test on the device. Of a scanner's files also what their
-    metadata tell, and what had to be assumed. Nothing is written.
+    resolution, estimated from a small test on the device; bad pixels and other defects, looked for
+    in some of the radiographs. Of a scanner's files also what their metadata tell, and what had to
+    be assumed. Nothing is written.
 
     Examples
     --------
@@ -21,11 +25,15 @@ def info(console: Console, reading: Reading, memory: Memory, scan: ScanPath) -> 
     from clra.app.scan_description import Facts, scanner_text, table
     from clra.app.speed import Speed, measure
     from clra.errors import DeviceError
+    from clra.methods.preparation import prepared
 
     limits = memory.limits()
     scanner = reading.scanner(scan)
     unread = scanner is not None and (scanner.missing or not scanner.normalisable(reading.white))
     opened = scanner.described() if scanner is not None and unread else reading.scan(scan)
+    if not unread:
+        with console.progress() as report:
+            opened = prepared(opened, correcting.options(), progress=report)
     facts = Facts.of(opened)
     try:
         with console.progress() as report:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from clra.app.console import Console, Memory, Reading
+from clra.app.correcting import Correcting
 from clra.errors import InputError
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ def reconstruct(
     sampling: Sampling,
     storing: Storing,
     iterating: Iterating,
+    correcting: Correcting,
     scan: Annotated[Path, typer.Argument(metavar="SCAN", help="NXtomo file.")],
     out: Annotated[
         Path,
@@ -244,6 +246,7 @@ def reconstruct(
                 device=console.device,
                 alignment=alignment,
                 options=options,
+                corrections=correcting.options(),
                 progress=progress,
                 checkpoint=checkpoint,
                 **sampled,

@@ -20,16 +20,19 @@ def report(
         Path | None,
         typer.Option(metavar="SCAN", help="The scan: adds slices and re-projections."),
     ] = None,
+    show: Annotated[
+        bool, typer.Option("--open", help="Show the page in the browser when it is written.")
+    ] = False,
 ) -> None:
     """Write a report of an alignment.
 
-    One HTML page that needs nothing else: corrections, convergence, confidence, and with the scan
-    slices and re-projections before and after.
+    One HTML page that needs nothing else, no network either: the verdict, warnings, corrections,
+    convergence, confidence, and with the scan slices and re-projections before and after.
 
     Examples
     --------
       clra report motion.h5 -o report.html
-      clra report motion.h5 -o report.html --scan scan.nxs
+      clra report motion.h5 -o report.html --scan scan.nxs --open
     """
     from clra.app.annotations import matched
     from clra.app.report.html_report import write_report
@@ -48,3 +51,7 @@ def report(
     write_report(out, findings)
     told = {} if findings.quality is None else {"quality": findings.quality}
     console.summary({"file": out, **told}, f"wrote {out}")
+    if show:
+        import webbrowser
+
+        webbrowser.open(out.absolute().as_uri())

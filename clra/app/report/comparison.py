@@ -24,6 +24,8 @@ _SLICE_COLUMNS, _VOLUME_COLUMNS = 800, 256
 # Sigma of the background that is taken off a difference of radiographs [pixel]: intensities of a
 # ramp-filtered reconstruction are a few per cent off over large areas.
 _BACKGROUND = 12.0
+# Slices that can be scrolled through; each takes some 20 KiB of the page, twice.
+_SLICES = 15
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,9 @@ class Comparison:
     matches : tuple of MatchedView
         Some views.
     pixel_mm : float
-        Edge of a pixel in those, at the sample.
+        Edge of a pixel in those, at the sample, and of a voxel in `slices`.
+    slices : tuple of (float, Pair)
+        Slices across the axis at several heights [mm], from the volumes that were re-projected.
     """
 
     horizontal: Pair
@@ -91,6 +95,7 @@ class Comparison:
     method: str
     matches: tuple[MatchedView, ...]
     pixel_mm: float
+    slices: tuple[tuple[float, Pair], ...] = ()
 
 
 def compare(
@@ -126,14 +131,16 @@ def compare(
     horizontal, vertical = (Pair(*slicer.images(plane)) for plane in _middle_planes(slicer.grid))
     level = volume_level(scan)
     radiographs = Radiographs(stream, scan, level)
+    matches, slices = _matches(stream, radiographs, scan.geometry, motion, confidence, valid_views)
     return Comparison(
         horizontal=horizontal,
         vertical=vertical,
         detail=_detail(horizontal),
         voxel_mm=slicer.grid.voxel_size,
         method=slicer.method,
-        matches=_matches(stream, radiographs, scan.geometry, motion, confidence, valid_views),
+        matches=matches,
         pixel_mm=_grid(scan.geometry, level).voxel_size,
+        slices=slices,
     )
 
 
@@ -182,24 +189,27 @@ def _matches(
     motion: Motion,
     confidence: NDArray[np.float64],
     valid_views: NDArray[np.bool_],
-) -> tuple[MatchedView, ...]:
+) -> tuple[tuple[MatchedView, ...], tuple[tuple[float, Pair], ...]]:
     chosen = _views_worth_showing(motion, confidence)
     views = sorted(chosen)
     measured = np.concatenate([radiographs.read(slice(view, view + 1)) for view in views])
     grid = _grid(geometry, radiographs.level)
-    differences, simulated = [], measured
+    differences, simulated, picked = [], measured, []
     moved = geometry.with_motion(motion)
     for name, full, used in (("before", geometry, None), ("after", moved, valid_views)):
         here = full.binned(radiographs.level) if radiographs.level > 1 else full
         stage = f"report: volume {name}"
         volume = ramp_fbp(stream, radiographs, here, grid, valid_views=used, stage=stage)
+        planes = _Picked(grid)
+        volume.write(planes)
+        picked.append(planes)
         simulated = _reprojected(stream, volume, here.subset(views))
         pairs = [_fitted(s, m) for s, m in zip(simulated, measured, strict=True)]
         simulated = np.stack(pairs)
         differences.append(
             [_without_background(m - s) for m, s in zip(measured, pairs, strict=True)]
         )
-    return tuple(
+    matches = tuple(
         MatchedView(
             view=view,
             why=chosen[view],
@@ -209,6 +219,28 @@ def _matches(
         )
         for k, view in enumerate(views)
     )
+    before, after = picked
+    heights = grid.coordinates()[2]
+    slices = tuple(
+        (float(heights[k]), Pair(before.planes[k], after.planes[k])) for k in before.wanted
+    )
+    return matches, slices
+
+
+class _Picked:
+    """Takes some planes of a volume, evenly from a tenth of its height to nine tenths."""
+
+    def __init__(self, grid: VolumeGrid) -> None:
+        last = grid.shape[0] - 1
+        places = np.linspace(0.1 * last, 0.9 * last, _SLICES).round().astype(int)
+        self.wanted = [int(k) for k in np.unique(places)]
+        self.planes: dict[int, Image] = {}
+
+    def write(self, start: int, part: Image) -> None:
+        """Take planes (n, y, x) from plane `start` on."""
+        for k in self.wanted:
+            if start <= k < start + len(part):
+                self.planes[k] = part[k - start].copy()
 
 
 def _views_worth_showing(motion: Motion, confidence: NDArray[np.float64]) -> dict[int, str]:

@@ -13,12 +13,10 @@ from matplotlib.ticker import (
     LogLocator,
     MaxNLocator,
     NullFormatter,
-    ScalarFormatter,
 )
 from numpy.typing import NDArray
 
 from clra.methods.alignment.result import Iteration
-from clra.model.motion import Motion
 
 Floats = NDArray[Any]
 
@@ -47,8 +45,6 @@ _STYLE: Any = {
     "savefig.facecolor": "white",
     "svg.hashsalt": "clra",  # the same report twice is the same file
 }
-# Points beyond which they are drawn as pixels: ten thousand vector circles make a page slow.
-_MOST_VECTOR_POINTS = 3000
 
 
 def drawn(
@@ -75,68 +71,6 @@ def drawn(
         figure.savefig(file, format=kind, dpi=dpi, metadata=metadata)
     mime = "image/svg+xml" if kind == "svg" else "image/png"
     return f"data:{mime};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
-
-
-def _points(axes: Any, x: Floats, y: Floats, colour: str, label: str | None = None) -> None:
-    size = 4.5 if len(x) <= 600 else 2.0
-    axes.plot(
-        x,
-        y,
-        ".",
-        color=colour,
-        markersize=size,
-        markeredgewidth=0,
-        label=label,
-        rasterized=len(x) > _MOST_VECTOR_POINTS,
-    )
-
-
-def _legend(axes: Any) -> None:
-    legend = axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.2,
-                         handletextpad=0.3, columnspacing=1.2)  # fmt: skip
-    for handle in legend.legend_handles:  # the points of many views are too small to tell colours
-        handle.set_markersize(7)
-
-
-def corrections(motion: Motion, *, returns: bool = False) -> str:
-    """Shift and magnification that undo the motion, against view number.
-
-    Parameters
-    ----------
-    motion : Motion
-        As estimated; its inverse is drawn, as in the paper's Figures 5 and 7.
-    returns : bool
-        Whether the stage came back after half of the views, which is then marked.
-
-    Returns
-    -------
-    str
-        Data address of an image.
-    """
-    undo = motion.inverse()
-    views = np.arange(motion.views)
-
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        _points(left, views, undo.shift_u, U, "u (columns)")
-        _points(left, views, undo.shift_v, V, "v (rows)")
-        left.set(xlabel="view", ylabel="correction of the shift [pixel]", title="Shift")
-        _legend(left)
-        _points(right, views, undo.magnification, SCALE)
-        right.set(xlabel="view", ylabel="correction of the magnification", title="Magnification")
-        right.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-        if np.ptp(undo.magnification) < 1e-6:
-            right.set_ylim(0.999, 1.001)
-        for axes in (left, right):
-            axes.set_xlim(-0.5, motion.views - 0.5)
-            if returns:
-                middle = (motion.views - 1) / 2
-                axes.axvline(middle, color=INK, lw=0.8, ls="--")
-                axes.annotate("the stage returns", (middle, 1), (4, -2), ha="left", va="top",
-                              xycoords=axes.get_xaxis_transform(), textcoords="offset points",
-                              fontsize=8, color="#5b6875")  # fmt: skip
-
-    return drawn(draw, (10.4, 3.5), "svg")
 
 
 def convergence(history: Sequence[Iteration]) -> str:
@@ -246,68 +180,3 @@ def _mark_levels(axes: Any, levels: Sequence[str]) -> None:
             color="#5b6875",
         )
         start += count
-
-
-def confidence(values: Floats, flagged: Sequence[int]) -> str:
-    """Confidence of each view, the flagged ones marked.
-
-    Parameters
-    ----------
-    values : ndarray, (views,)
-        0 to 1.
-    flagged : sequence of int
-        Views that are rejected.
-
-    Returns
-    -------
-    str
-        Data address of an image.
-    """
-    views = np.arange(len(values))
-    rejected = np.isin(views, np.asarray(flagged, dtype=int))
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        _points(axes, views[~rejected], values[~rejected], U, "valid")
-        if rejected.any():
-            axes.plot(
-                views[rejected], values[rejected], "x", color=WARN, ms=6, mew=1.6, label="flagged"
-            )
-            _legend(axes)
-        low = float(values[~rejected].min()) if (~rejected).any() else 0.0
-        axes.set_ylim(-0.05 if rejected.any() else max(0.0, low - 0.1), 1.02)
-        axes.set_xlim(-0.5, len(values) - 0.5)
-        axes.set(xlabel="view", ylabel="confidence", title="Confidence of each view")
-
-    return drawn(draw, (10.4, 2.4), "svg")
-
-
-def error_of_views(raw: Floats, gauge_free: Floats) -> str:
-    """Error of the estimated shift of each view.
-
-    Parameters
-    ----------
-    raw, gauge_free : ndarray, (views, 2)
-        Estimate minus truth along u and v [pixel], as it is and without the gauge.
-
-    Returns
-    -------
-    str
-        Data address of an image.
-    """
-    views = np.arange(len(raw))
-
-    def draw(figure: Figure) -> None:
-        for axes, k, name, colour in zip(
-            figure.subplots(1, 2, sharey=True), (0, 1), ("u (columns)", "v (rows)"), (U, V),
-            strict=True,
-        ):  # fmt: skip
-            axes.axhspan(-0.5, 0.5, color="#eef3f7", zorder=0)
-            _points(axes, views, raw[:, k], FAINT, "raw")
-            _points(axes, views, gauge_free[:, k], colour, "gauge-free")
-            axes.set(xlabel="view", title=f"Error of {name}")
-            axes.set_xlim(-0.5, len(raw) - 0.5)
-            _legend(axes)
-        figure.axes[0].set_ylabel("estimate - truth [pixel]")
-
-    return drawn(draw, (10.4, 3.2), "svg")

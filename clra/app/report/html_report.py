@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from clra.app.progress_bar import duration
-from clra.app.report import figures, page
+from clra.app.report import figures, page, view_charts
 from clra.app.report.before_after import before_and_after
-from clra.app.report.summary import Errors, Findings
+from clra.app.report.summary import Errors, Findings, Floats
+from clra.app.report.verdict_box import verdict_box
 from clra.app.scan_description import listed
 from clra.io.atomic import atomic_path
-from clra.methods.alignment.agreement import Agreement
-from clra.methods.alignment.result import AlignmentResult, Iteration
+from clra.methods.alignment.result import Iteration
+from clra.methods.assessment.agreement import Agreement
 
 _COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
 _UNOBSERVABLE = {
     "taken out": " It was taken out of the motion.",
     "left in": " It was left in the motion; clra align --gauge anchored takes it out.",
 }
-_RETURNS = " Errors of the stage come mirrored about the dashed line, where it turns back."
 
 
 def write_report(path: str | os.PathLike[str], findings: Findings) -> None:
@@ -55,17 +55,14 @@ def render(findings: Findings) -> str:
     """
     result = findings.result
     body = [
+        verdict_box(result.quality),
+        *(page.told(f.severity, f.message, *_advice(f.advice)) for f in findings.notes),
         page.cards(_cards(findings)),
-        *(
-            [page.section("Warnings", *map(page.paragraph, findings.notes))]
-            if findings.notes
-            else []
-        ),
-        _corrections(result),
-        *([_history(result.history)] if result.history else []),
-        *([_errors(findings.errors)] if findings.errors else []),
         *before_and_after(findings.comparison),
-        _trust(result),
+        _corrections(findings),
+        *([_errors(findings.errors, findings.angles)] if findings.errors else []),
+        _trust(findings),
+        *([_history(result.history)] if result.history else []),
         *([_quality(findings.quality)] if findings.quality else []),
         _settings(findings),
     ]
@@ -117,19 +114,17 @@ def _cards(findings: Findings) -> list[tuple[str, str, str, str]]:
     return cards
 
 
-def _corrections(result: AlignmentResult) -> str:
+def _corrections(findings: Findings) -> str:
+    result = findings.result
     returns = result.about.get("path") == "double helix"
     return page.section(
         "Correction of each radiograph",
-        page.figure(
-            figures.corrections(result.motion, returns=returns),
-            "Shift (left) and magnification (right) that bring each measured radiograph back to "
-            "where the ideal geometry puts it: the inverse of the estimated motion. Positive u is "
-            "toward higher columns, positive v toward higher rows; in pixels of the full detector."
-            + (_RETURNS if returns else ""),
-            "Shift and magnification corrections against view number",
-        ),
+        view_charts.corrections(result.motion, findings.angles, returns=returns),
     )
+
+
+def _advice(advice: str) -> list[str]:
+    return [page.paragraph(f"What to do: {advice}.")] if advice else []
 
 
 def _history(history: Sequence[Iteration]) -> str:
@@ -168,11 +163,11 @@ def _history(history: Sequence[Iteration]) -> str:
     return page.section(
         "Convergence",
         page.figure(figures.convergence(history), caption, "Convergence by iteration"),
-        page.table([*head, "time"], rows),
+        page.folded("Numbers of each iteration", page.table([*head, "time"], rows)),
     )
 
 
-def _errors(errors: Errors) -> str:
+def _errors(errors: Errors, angles: Floats | None) -> str:
     means = errors.means()
     names = {
         "raw": "mae",
@@ -187,29 +182,19 @@ def _errors(errors: Errors) -> str:
     ]
     return page.section(
         "Error of each view",
-        page.figure(
-            figures.error_of_views(errors.raw[:, :2], errors.gauge_free[:, :2]),
-            "Estimated minus true shift (the scan is a simulation that knows its motion). Raw: as "
-            "it is. Gauge-free: without what a movement of the sample as a whole explains, which "
-            "changes where the volume lies but not how sharp it is. Shaded: half a pixel, below "
-            "which motion leaves no visible trace.",
-            "Error of the shift against view number",
+        view_charts.error_of_views(errors, angles),
+        page.folded(
+            "Mean errors",
+            page.table(["mean absolute error", "u [pixel]", "v [pixel]", "magnification"], rows),
+            shown=True,
         ),
-        page.table(["mean absolute error", "u [pixel]", "v [pixel]", "magnification"], rows),
     )
 
 
-def _trust(result: AlignmentResult) -> str:
+def _trust(findings: Findings) -> str:
+    result = findings.result
     flagged = result.flagged
-    parts = [
-        page.figure(
-            figures.confidence(result.confidence, flagged),
-            "Correlation of each measured radiograph with its re-projection in the band of "
-            "frequencies that is registered. A flagged view fits far worse than the others; it was "
-            "given the motion of its neighbours.",
-            "Confidence against view number",
-        )
-    ]
+    parts = [view_charts.confidence(result.confidence, flagged, findings.angles)]
     if result.median_sigma:
         u, v, m = result.median_sigma
         parts.append(
@@ -228,7 +213,7 @@ def _trust(result: AlignmentResult) -> str:
                 "movement of the sample as a whole would explain. Radiographs hardly see it, and "
                 "the volume is as sharp with it as without." + _UNOBSERVABLE.get(unobservable, "")
             ),
-            page.bars(result.gauge, "pixel"),
+            page.folded("Gauge content by movement", page.bars(result.gauge, "pixel")),
         ]
     return page.section("How far to trust it", *parts)
 
@@ -279,7 +264,8 @@ def _settings(findings: Findings) -> str:
     parts = [page.columns(tables)]
     if command:
         parts += [page.paragraph("To do it again:"), page.code(command)]
-    return page.section("Scan, settings and how to do it again", *parts)
+    folded = page.folded("All settings", *parts)
+    return page.section("Scan, settings and how to do it again", folded)
 
 
 def _versions() -> dict[str, str]:

@@ -1,50 +1,12 @@
 """The building blocks of a self-contained HTML page."""
 
+import json
 from collections.abc import Iterable, Mapping
 from html import escape
+from pathlib import Path
+from typing import Any
 
-_CSS = """
-:root { --ink: #26323d; --soft: #5b6875; --line: #dfe5ea; --accent: #0072b2; --paper: #fff; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #f3f5f7; color: var(--ink); line-height: 1.55;
-  font: 15.5px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
-main { max-width: 1100px; margin: 0 auto; padding: 2.4rem 1.4rem 3rem; }
-h1 { font-size: 1.75rem; line-height: 1.2; margin: 0 0 .3rem; letter-spacing: -.01em; }
-h2 { font-size: 1.12rem; margin: 0 0 .8rem; }
-p { margin: 0 0 .8rem; max-width: 46rem; }
-header p { color: var(--soft); margin-bottom: 1.4rem; }
-section { background: var(--paper); border: 1px solid var(--line); border-radius: 10px;
-  padding: 1.2rem 1.4rem 1.1rem; margin: 0 0 1.1rem; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(285px, 1fr)); gap: .7rem;
-  margin: 0 0 1.1rem; }
-.card { background: var(--paper); border: 1px solid var(--line); border-radius: 10px;
-  padding: .75rem 1rem .8rem; }
-.card .name { color: var(--soft); font-size: .82rem; }
-.card .value { font-size: 1.4rem; font-weight: 600; line-height: 1.3;
-  font-variant-numeric: tabular-nums; }
-.card .unit { font-size: .85rem; font-weight: 400; color: var(--soft); }
-.card .note { color: var(--soft); font-size: .8rem; line-height: 1.35; }
-figure { margin: 0 0 1.1rem; }
-figure:last-child { margin-bottom: .2rem; }
-figure img { display: block; width: 100%; height: auto; }
-figcaption { color: var(--soft); font-size: .88rem; margin-top: .45rem; max-width: 52rem; }
-table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: .28rem 1.4rem .28rem 0; border-bottom: 1px solid var(--line);
-  vertical-align: top; }
-td { overflow-wrap: anywhere; }
-tr:last-child > * { border-bottom: 0; }
-th { font-weight: 500; color: var(--soft); white-space: nowrap; }
-.wide { overflow-x: auto; }
-td.number, th.number { text-align: right; }
-.bar { display: inline-block; height: .6em; border-radius: 2px; background: var(--accent);
-  opacity: .75; vertical-align: baseline; }
-pre { background: #f3f5f7; border-radius: 6px; padding: .7rem .9rem; margin: 0; overflow-x: auto;
-  font: .88rem/1.5 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
-.columns { display: grid; grid-template-columns: repeat(auto-fit, minmax(330px, 1fr));
-  gap: 0 2.4rem; margin-bottom: 1rem; }
-footer { color: var(--soft); font-size: .85rem; }
-@media print { body { background: #fff; } section, .card { break-inside: avoid; } }
-"""
+_FOLDER = Path(__file__).parent
 
 
 def page(title: str, subtitle: str, body: Iterable[str], footer: str) -> str:
@@ -52,11 +14,46 @@ def page(title: str, subtitle: str, body: Iterable[str], footer: str) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n<main>\n"
+        f"<title>{escape(title)}</title>\n<style>\n{_asset('page.css')}</style>\n</head>\n<body>\n"
+        "<main>\n"
         f"<header><h1>{escape(title)}</h1>\n<p>{escape(subtitle)}</p></header>\n"
         + "\n".join(body)
-        + f"\n<footer>{escape(footer)}</footer>\n</main>\n</body>\n</html>\n"
+        + f"\n<footer>{escape(footer)}</footer>\n</main>\n"
+        f"<script>\n{_asset('page.js')}</script>\n</body>\n</html>\n"
     )
+
+
+def _asset(name: str) -> str:
+    return (_FOLDER / name).read_text(encoding="utf-8")
+
+
+def embedded(data: Any) -> str:
+    """Return data for the page's script; nothing in it can end the element."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f'<script type="application/json">{text}</script>'
+
+
+def told(kind: str, what: str, *more: str) -> str:
+    """Return a box in the colour of `kind`: info, good, warning, doubtful, error or failed.
+
+    `what` is text, `more` are pieces of HTML.
+    """
+    return (
+        f'<div class="told {kind}"><div class="what">{escape(what)}</div>'
+        + "".join(more)
+        + "</div>"
+    )
+
+
+def listing(texts: Iterable[str]) -> str:
+    """List of texts."""
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>"
+
+
+def folded(summary: str, *body: str, shown: bool = False) -> str:
+    """Part that the reader can fold."""
+    opened = " open" if shown else ""
+    return f"<details{opened}><summary>{escape(summary)}</summary>" + "".join(body) + "</details>"
 
 
 def section(title: str, *body: str) -> str:
@@ -72,7 +69,7 @@ def paragraph(text: str) -> str:
 def figure(address: str, caption: str, alt: str) -> str:
     """Figure with its caption; `address` is that of an image."""
     return (
-        f'<figure><img src="{address}" alt="{escape(alt)}">'
+        f'<figure><div class="wide"><img src="{address}" alt="{escape(alt)}"></div>'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
@@ -122,6 +119,11 @@ def bars(values: Mapping[str, float], unit: str) -> str:
 def columns(parts: Iterable[str]) -> str:
     """Pieces of HTML side by side, as far as there is room."""
     return '<div class="columns">' + "".join(f"<div>{part}</div>" for part in parts) + "</div>"
+
+
+def pairs(parts: Iterable[str]) -> str:
+    """Pieces of HTML two in a row, as far as there is room."""
+    return '<div class="pair">' + "".join(parts) + "</div>"
 
 
 def code(text: str) -> str:

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from clra.app.plausible import doubt_of_shifts
 from clra.app.progress_bar import duration
 from clra.app.scan_description import Facts, table, views_flagged
+from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.quality import Quality
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
@@ -18,7 +20,7 @@ from clra.model.scan import Scan
 
 if TYPE_CHECKING:
     from clra.app.report.comparison import Comparison
-    from clra.methods.alignment.agreement import Agreement
+    from clra.methods.assessment.agreement import Agreement
     from clra.progress import ProgressCallback
 
 Floats = NDArray[np.float64]
@@ -93,6 +95,8 @@ class Findings:
         Of the scan, for reading.
     quality : Agreement, optional
         What the radiographs alone tell, where the scan was at hand.
+    angles : ndarray, (views,), optional
+        Of the views, not folded into one turn [degree].
     """
 
     result: AlignmentResult
@@ -100,13 +104,14 @@ class Findings:
     comparison: "Comparison | None" = None
     facts: Mapping[str, str] = field(default_factory=dict)
     quality: "Agreement | None" = None
+    angles: Floats | None = None
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Finding, ...]:
         """What the run warned of, and what the scan itself tells against its result."""
         doubt = "" if self.quality is None else doubt_of_shifts(self.quality, self.result.motion)
-        told = (*map(str, self.result.warnings), doubt)
-        return tuple(dict.fromkeys(filter(None, told)))
+        told = [*self.result.warnings, *([Finding("disagreement", doubt)] if doubt else [])]
+        return tuple({str(finding): finding for finding in told}.values())
 
 
 def findings_of(
@@ -139,7 +144,7 @@ def findings_of(
     if scan is None:
         return Findings(result)
     from clra.app.report.comparison import compare, volume_level
-    from clra.methods.alignment.agreement import agreement
+    from clra.methods.assessment.agreement import agreement
     from clra.ops.streaming.stream import Stream
 
     stream = Stream(
@@ -158,7 +163,20 @@ def findings_of(
         if _in_both_halves(result.valid_views)
         else None,
         facts=Facts.of(scan).lines(),
+        angles=angles_of(part),
     )
+
+
+def angles_of(scan: Scan) -> Floats:
+    """Return the angle of each view about the axis, not folded into one turn [degree].
+
+    Parameters
+    ----------
+    scan : Scan
+        With its geometry.
+    """
+    x, y = scan.geometry.source[:, 0], scan.geometry.source[:, 1]
+    return np.asarray(np.rad2deg(np.unwrap(np.arctan2(x, -y))))
 
 
 def _in_both_halves(valid_views: NDArray[np.bool_]) -> bool:
@@ -203,7 +221,9 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "quality": None if result.quality is None else result.quality.as_dict(),
         **(errors.means() if errors else {}),
     }
-    lines = {
+    judged = result.quality
+    lines = {"verdict": _verdict(judged)} if isinstance(judged, Quality) else {}
+    lines |= {
         "run": f"{motion.views} views, {_levels(result)}, {duration(seconds)}",
         "shift": f"median {median_u:.2f}, {median_v:.2f} pixel along u, v; "
         f"largest {largest_u:.2f}, {largest_v:.2f}",
@@ -226,7 +246,17 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         lines["error"] = _error(means, "", result)
         if result.flagged:
             lines["not flagged"] = _error(means, "valid_", result)
-    return values, table(lines)
+    # Last, where they are seen: numbers above may flatter.
+    told = [f"{f.severity}: {f}" for f in result.warnings if f.severity != "info"]
+    return values, "\n".join([table(lines), *told])
+
+
+def _verdict(quality: Quality) -> str:
+    before, after = (100 * r for r in (quality.residual_before, quality.residual_after))
+    return (
+        f"{quality.verdict}; expected error {quality.error:.2f} pixel; {after:.1f} % of a held-out "
+        f"radiograph not predicted, {before:.1f} % at the start"
+    )
 
 
 def _unobservable(result: AlignmentResult) -> str:

@@ -16,9 +16,11 @@ from clra.model.bad_pixels import Patches
 Floats = NDArray[np.float32]
 Frames = NDArray[np.intp]
 
-# A frame with more saturated pixels than this part of it is refused. Below, the saturated pixels
-# are hot ones or the edge of a beam; above, the sample itself has lost its contrast somewhere.
-_SATURATED = 0.01
+# Part of the pixels of a flat that have the highest counts, all the same, if it is clipped: in the
+# noise of a flat that is not, a handful.
+_CLIPPED = 0.002
+# A pixel whose flat is below this part of its neighbours' on all sides sees nothing but noise.
+_DIM = 0.1
 # Flats that are not above the dark in more than this part of the detector are no flats.
 _DEAD = 0.5
 
@@ -28,7 +30,8 @@ class CountedRadiographs:
 
     ``(counts - dark) / (flat - dark)``, with the mean of the dark frames and a flat that runs
     linearly from one group of consecutive flat frames to the next by the number of the frame. Where
-    a flat is not above the dark the pixel is dead: it gets the median of its good neighbours.
+    a flat is saturated, or not above the dark, the pixel is bad: it is interpolated from its good
+    neighbours.
 
     Parameters
     ----------
@@ -54,13 +57,13 @@ class CountedRadiographs:
     notes : tuple of str
         What was noticed: for users.
     mask : ndarray of bool, (rows, columns), or None
-        False where dead pixels stand so close together that their values are far-fetched.
+        False where bad pixels stand so close together that their values are far-fetched.
 
     Raises
     ------
     InputError
         If there is neither flat nor `white`, or flats do not stand above the darks. On slicing:
-        if a frame cannot be read, has pixels that are no finite numbers, or is saturated.
+        if a frame cannot be read or has pixels that are no finite numbers.
     """
 
     def __init__(
@@ -79,7 +82,7 @@ class CountedRadiographs:
         self._path = path
         self._field = str(getattr(frames, "name", "frames"))
         self._views = views
-        self._warned = False
+        self._warned = self._clipped = False
         self._saturation = saturation
         if saturation is None and frames.dtype.kind in "iu":
             self._saturation = float(np.iinfo(frames.dtype).max)
@@ -109,7 +112,7 @@ class CountedRadiographs:
         return out if np.ndim(frames) else out[0]
 
     def _prepare(self, flats: Frames, darks: Frames, white: float | None) -> None:
-        """Average darks and flats and find the dead pixels."""
+        """Average darks and flats and find the bad pixels."""
         if white is None and not len(flats):
             raise InputError.at(
                 self._path, "image_key", "no flat frame (image_key 1)",
@@ -126,8 +129,8 @@ class CountedRadiographs:
             groups = []
             self._flats.append(np.full(detector, white, np.float32) - self._dark)
         self._positions = np.array([float(group.mean()) for group in groups] or [0.0])
-        self._flats += [self._mean(group, flat=True) - self._dark for group in groups]
-        dead = np.any([flat <= 0 for flat in self._flats], axis=0)
+        self._flats += [self._flat(group) for group in groups]
+        dead = np.any([_dim(flat) for flat in self._flats], axis=0)
         if dead.mean() > _DEAD:
             raise InputError.at(
                 self._path, self._field,
@@ -138,7 +141,10 @@ class CountedRadiographs:
             flat[dead] = 1.0
         self._patches = Patches(dead)
         if dead.any():
-            self._note(f"{int(dead.sum())} dead pixels (flat not above dark) filled from beside")
+            self._note(
+                f"{int(dead.sum())} bad pixels (saturated or dim in a flat field) interpolated "
+                "from their neighbours"
+            )
         if self._patches.far.any():
             self.mask = ~self._patches.far
 
@@ -159,15 +165,34 @@ class CountedRadiographs:
             image /= (1 - weight) * self._flats[right - 1] + weight * self._flats[right]
         self._patches.fill(image)
 
-    def _mean(self, frames: Frames, *, flat: bool = False) -> Floats:
+    def _mean(self, frames: Frames) -> Floats:
         """Mean of some frames, read one by one."""
         total = np.zeros(self.shape[1:], np.float64)
         for frame in frames:
-            counts = self._read(int(frame), 1)
-            if flat:
-                self._check_saturation(counts, int(frame))
-            total += counts[0]
+            total += self._read(int(frame), 1)[0]
         return np.asarray(total / len(frames), np.float32)
+
+    def _flat(self, frames: Frames) -> Floats:
+        """Mean of some flats above the dark; 0 where one is saturated."""
+        total = np.zeros(self.shape[1:], np.float64)
+        saturated = np.zeros(self.shape[1:], np.bool_)
+        for frame in frames:
+            counts = self._read(int(frame), 1)
+            self._check_clipping(counts[0], int(frame))
+            if self._saturation is not None:
+                full = counts[0] >= self._saturation
+                if full.mean() > _DEAD:
+                    raise InputError.at(
+                        self._path, self._field,
+                        f"flat frame {frame} with {int(full.sum())} pixels at "
+                        f"{self._saturation:g} counts",
+                        f"at most {_DEAD:.0%} of the pixels saturated",
+                    )  # fmt: skip
+                saturated |= full
+            total += counts[0]
+        flat = np.asarray(total / len(frames), np.float32) - self._dark
+        flat[saturated] = 0
+        return flat
 
     def _read(self, start: int, count: int) -> NDArray[Any]:
         """Read consecutive frames as they are; refuse pixels that are no finite numbers."""
@@ -194,20 +219,49 @@ class CountedRadiographs:
         return counts
 
     def _check_saturation(self, counts: NDArray[Any], start: int) -> None:
-        """Refuse frames that are saturated; warn once of a few saturated pixels."""
-        if self._saturation is None:
+        """Warn once of saturated pixels; whole frames are rejected when views are compared."""
+        if self._saturation is None or self._warned:
             return
         full = np.count_nonzero(counts >= self._saturation, axis=(1, 2))
         worst = int(np.argmax(full))
-        found = f"frame {start + worst} with {full[worst]} pixels at {self._saturation:g} counts"
-        if full[worst] > _SATURATED * counts[0].size:
-            raise InputError.at(
-                self._path, self._field, found,
-                f"at most {_SATURATED:.0%} of the pixels saturated",
-            )  # fmt: skip
-        if full[worst] and not self._warned:
+        if full[worst]:
             self._warned = True
+            found = (
+                f"frame {start + worst} with {full[worst]} pixels at {self._saturation:g} counts"
+            )
             warn("saturation", f"{self._path}: {self._field}: {found}: saturated")
+
+    def _check_clipping(self, flat: NDArray[Any], frame: int) -> None:
+        """Warn once of a flat whose brightest pixels all have the same counts."""
+        top, size = float(flat.max()), flat.size
+        clipped = int(np.count_nonzero(flat == top))
+        if self._clipped or not _CLIPPED * size < clipped < 0.9 * size or top <= 0:
+            return
+        below = int(np.count_nonzero(flat >= top - max(3.0, 1e-3 * top))) - clipped
+        # Without noise all that is bright has the same counts, and nothing has a little less.
+        if 0.02 * clipped < below < 0.33 * clipped and top != self._saturation:
+            self._clipped = True
+            warn(
+                "clipping",
+                f"{self._path}: {self._field}: flat frame {frame} with {clipped} pixels at exactly "
+                f"{top:g} counts and none above: the detector seems to saturate there; line "
+                "integrals of thin parts of the sample are too low",
+                "expose less, or set saturation_value in the file",
+            )
+
+
+def _dim(flat: Floats) -> NDArray[np.bool_]:
+    """Where a flat above the dark is not positive, or far below two pixels beside it each way."""
+    rows, columns = flat.shape
+    dim = np.ones(flat.shape, np.bool_)
+    for axis in (0, 1):
+        reach = min(2, flat.shape[axis] - 1)
+        padded = np.pad(flat, reach, mode="reflect" if min(rows, columns) > 2 else "edge")
+        for step in (-reach, reach):
+            moved = np.roll(padded, step, axis)[reach : reach + rows, reach : reach + columns]
+            dim &= flat < _DIM * moved
+    found: NDArray[np.bool_] = dim | (flat <= 0)
+    return found
 
 
 def _runs(frames: Frames) -> list[tuple[int, int]]:

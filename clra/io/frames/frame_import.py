@@ -14,9 +14,11 @@ from clra.errors import InputError
 from clra.findings import warn
 from clra.io.atomic import ensure_writable
 from clra.io.frames.stacks import FrameStack, RawLayout, Source, read_numbers, warn_of_gaps
+from clra.io.frames.turned import TurnedFrames
 from clra.io.nxtomo.clra_group import KINDS
 from clra.io.nxtomo.geometry_fields import Fields, far_source_distance
 from clra.io.nxtomo.writer import write_nxtomo
+from clra.model.validation import all_but
 from clra.progress import ProgressCallback
 
 # Angles that all lie within this [degree] are warned of: a whole turn is 6.28 rad.
@@ -64,6 +66,8 @@ def import_frames(
     z_translation: Source | ArrayLike | None = None,
     centre_offset: float = 0.0,
     rotation: str = "ccw",
+    axis: str = "vertical",
+    exclude: Sequence[int] = (),
     name: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Imported:
@@ -114,6 +118,12 @@ def import_frames(
         higher columns [pixel].
     rotation : {"ccw", "cw"}
         How the sample turns as its angle grows, seen from above.
+    axis : {"vertical", "horizontal"}
+        How the rotation axis runs in the frames. Of a horizontal one the right end becomes the top:
+        the frames are turned by 90 degrees as they are copied, and `shape` and `pixel_size` are of
+        the frames as they are stored. If it is the left end that is up, give the other `rotation`.
+    exclude : sequence of int
+        Radiographs that are marked as invalid, from 0: readers leave them out.
     name : str, optional
         Title of the scan; the name of `out` if not given.
     progress : callable, optional
@@ -137,7 +147,7 @@ def import_frames(
         raise InputError.at("--kind", "kind", f"{kind!r} and flats or darks", "neither of them")
     with ExitStack() as files:
         stack, bright, after, dark = (
-            files.enter_context(closing(FrameStack(given, layout))) if _any(given) else None
+            files.enter_context(closing(_opened(given, layout, axis))) if _any(given) else None
             for given in (frames, flats, flats_after, darks)
         )
         if stack is None:
@@ -160,6 +170,9 @@ def import_frames(
         told = "of" if len(stack.files) == 1 else f"from {stack.files[0].name} to"
         told += f" {stack.files[-1].name}"
         row_step, column_step = _pixel(pixel_size)
+        if axis == "horizontal":
+            row_step, column_step = column_step, row_step
+        valid_views = all_but(exclude, views)
         if rotation not in ("ccw", "cw"):
             raise InputError.at("--rotation", "rotation", repr(rotation), "ccw or cw")
         degrees = read_numbers(angles, "angles", views, told)
@@ -198,6 +211,7 @@ def import_frames(
             kind=kind,
             dtype=np.result_type(*(part.dtype for part in stacks)),
             name=name or os.path.basename(os.fspath(out)),
+            valid_views=valid_views,
             fields=fields,
             propagation_distance=propagation,
             progress=progress,
@@ -209,6 +223,16 @@ def import_frames(
             shape=detector,
             angles_deg=(float(degrees[0]), float(degrees[-1])),
         )
+
+
+def _opened(
+    given: Source | Sequence[Source], layout: RawLayout, axis: str
+) -> FrameStack | TurnedFrames:
+    """Open frames; turn them if the axis lies in them."""
+    if axis not in ("vertical", "horizontal"):
+        raise InputError.at("--axis", "axis", repr(axis), "vertical or horizontal")
+    stack = FrameStack(given, layout)
+    return stack if axis == "vertical" else TurnedFrames(stack)
 
 
 def _any(files: Source | Sequence[Source]) -> bool:

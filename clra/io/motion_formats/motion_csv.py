@@ -49,7 +49,7 @@ def write_motion_csv(
 
 
 def is_motion_csv(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a table as :func:`read_motion_csv` reads it, by the names of its columns."""
+    """Whether a file is a table for :func:`read_motion_csv`, by the names of its columns."""
     if Path(path).suffix.lower() != ".csv":
         return False
     try:

@@ -43,7 +43,7 @@ def with_one_pixel(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
 
 
 def cil_arrays(geometry: ConeBeamGeometry) -> dict[str, Any]:
-    """Return the arguments of CIL's ``AcquisitionGeometry.create_Cone3D_SOUV`` and its panel.
+    """Return the arguments of CIL's ``create_Cone3D_SOUV``, detector included.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def cil_arrays(geometry: ConeBeamGeometry) -> dict[str, Any]:
     -------
     dict
         The sets of positions and directions [mm], ``num_pixels`` and ``pixel_size`` as (columns,
-        rows), and ``origin``: the panel's pixel (0, 0) is ours.
+        rows), and ``origin``: its pixel (0, 0) is ours.
     """
     same = with_one_pixel(geometry)
     wide, high = (np.linalg.norm(step, axis=1) for step in (same.u, same.v))

@@ -8,14 +8,15 @@ from clra.errors import Cancelled, InputError
 from clra.findings import Finding, collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.quality import assess
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
+from clra.methods.assessment.quality import assess
+from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
 from clra.methods.preparation import prepared, with_detector_of
-from clra.methods.radiograph_checks import refuse_counts
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.model.corrections.correction_options import CorrectionOptions
@@ -29,7 +30,7 @@ from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
 METHODS = ("ra", "imgr", "reference")
-ESTIMATES = ("shift", "shift+scale", "source")
+ESTIMATES = ("shift", "shift+scale", "source", *FREE)
 GAUGES = ("anchored", "free")
 # Valid views below which none can be held out.
 _ENOUGH_TO_JUDGE = 4
@@ -71,10 +72,13 @@ def align(
         detector of 384 pixels and more "6ER-3QR", else a quarter of the resolution
         until converged (at most 20 iterations), then half until converged (at most 3, often one).
         For "imgr" the levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
-    estimate : {"shift+scale", "shift", "source"}
+    estimate : {"shift+scale", "shift", "source", "rigid", "shift+roll", "shift+scale+roll"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
         source that moved, in all three directions: this explains the parallax by which what is
-        near the source shifts farther than what is far from it, too.
+        near the source shifts farther than what is far from it, too. "rigid" estimates three
+        translations and three rotations of the sample in each view, after the shifts; the others
+        estimate its roll about the beam beside shifts. The motion is then a
+        :class:`clra.model.rigid.rigid_motion.RigidMotion`, and `sigma` has six columns.
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
@@ -159,10 +163,13 @@ def align(
             versions=versions(stream.device),
             scan=scan.name,
             checksum=scan.checksum(),
-            about={"unobservable": "taken out" if anchor else "left in"},
+            about={
+                "unobservable": "taken out" if anchor else "left in",
+                "corrections": "" if scan.corrections is None else str(scan.corrections),
+            },
         )
 
-    scale = estimate != "shift"
+    scale = estimate in ("shift+scale", "source", "shift+scale+roll")
     refuse_counts(scan)
     with collected() as findings:
         scan = prepared(scan, corrections, progress=progress)
@@ -205,10 +212,11 @@ def align(
                     saved=saved,
                 )
             else:
+                region = region_of(stream, part, grid, own=own_grid)
                 run = CoarseToFine(
                     stream,
                     part,
-                    region_of(stream, part, grid, own=own_grid),
+                    region,
                     schedule,
                     scale,
                     anchor,
@@ -219,11 +227,16 @@ def align(
                 )
                 run.align(stages, saved)
                 aligned = run.result()
+                if estimate in FREE:
+                    aligned = RigidAlignment(
+                        stream, part, region, solver, estimate, aligned, anchor
+                    ).align()
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
             aligned, told_of = _judged(stream, part, aligned, start, scale)
-            findings += told_of
+            for finding in told_of:
+                finding.record()
         result = told(aligned)
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()

@@ -232,7 +232,7 @@ class AlignmentStep:
         return self._coverage.normalise(
             queue,
             volume,
-            math.pi,
+            self._scale,
             lowest=self._lowest,
             volume_order=self._order,
             wait_for=[event],

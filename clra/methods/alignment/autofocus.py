@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.alignment.align import align
-from clra.methods.alignment.slice_sharpness import VIEWS, Slices
+from clra.methods.assessment.axis_of_arc import axis_offset
+from clra.methods.assessment.slice_sharpness import VIEWS, Slices
 from clra.model.detector_pose import with_detector
-from clra.model.sampling.angular_coverage import covered
+from clra.model.sampling.angular_coverage import covered, is_circle
 from clra.model.scan import Scan
 from clra.model.schedule import level_name
 from clra.ops.registration.gauss_newton import SMALLEST
@@ -60,7 +61,8 @@ class Focus:
     tilt : float
         Angle by which the detector's image is turned, from columns toward rows [rad].
     sharpening : float
-        Mean squared gradient of the slices, relative to that of the scan's own geometry.
+        Mean squared gradient of the slices, relative to that of the scan's own geometry; of an arc
+        how much better the rays of a line agree, in squares.
     """
 
     offset_u: float
@@ -86,7 +88,8 @@ def autofocus(
     Parameters
     ----------
     scan : Scan
-        Any trajectory of at least a whole turn; it may have moved.
+        Any trajectory; it may have moved. Of an arc the axis alone is found, by the rays that are
+        measured twice (:func:`clra.methods.assessment.axis_of_arc.axis_offset`).
     device : str or cl.Device, optional
         As :func:`clra.ops.runtime.devices.choose_device` takes it.
     progress : callable, optional
@@ -102,21 +105,18 @@ def autofocus(
     Raises
     ------
     InputError
-        If views cover less than a turn, the best lies at the end of what is searched, or slices
-        have no structure.
+        If the best lies at the end of what is searched, slices have no structure, or hardly a ray
+        of an arc is measured twice.
     """
-    angle = covered(scan.geometry)
-    if angle < 2 * math.pi:
-        # Slices of half a turn are sharpest with a detector tilted by 3 degrees too much.
-        raise InputError(
-            f"{scan.name}: found views over {math.degrees(angle):.0f} degrees, expected a whole "
-            "turn to find the axis and the detector's tilt by"
-        )
     limits: dict[str, Any] = {
         "max_device_memory": max_device_memory,
         "max_host_memory": max_host_memory,
     }
     stream = Stream(device, report=progress, **limits)
+    if is_circle(scan.geometry) and covered(scan.geometry) < 2 * math.pi:
+        # Slices of half a turn are sharpest with a detector tilted by 3 degrees too much.
+        offset, gain = axis_offset(stream, scan)
+        return Focus(offset, 0.0, gain)
     every = max(1, scan.views // VIEWS)
     scan = scan.subset(slice(0, None, every))
     coarse = Slices(stream, scan, scan.geometry, _SEARCH_COLUMNS, _SEARCH_INSIDE)

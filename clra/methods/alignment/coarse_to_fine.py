@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from clra.errors import Cancelled
 from clra.findings import Finding
-from clra.methods.alignment.acceleration import MotionSteps
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
-from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
+from clra.methods.alignment.rejected_views import Rejections
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
-from clra.methods.alignment.slow_modes import SlowSteps, held
+from clra.methods.alignment.steps.acceleration import MotionSteps
+from clra.methods.alignment.steps.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     history_from,
@@ -93,8 +93,11 @@ class CoarseToFine:
     fresh: bool = field(init=False)  # nothing was known of the motion before it
     steps: MotionSteps = field(init=False)  # of the level
     rejected: NDArray[np.bool_] = field(init=False)
+    rejections: Rejections = field(init=False)
 
     def __post_init__(self) -> None:
+        excluded = () if self.scan.corrections is None else self.scan.corrections.excluded
+        self.rejections = Rejections(self.scan.views, excluded)
         self.motion = self.start
         points = sample_points(self.region.sample)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
@@ -127,7 +130,7 @@ class CoarseToFine:
         # 1, 7: down-sample the measured radiographs
         level = Level(self.stream, self.scan, self.region, self.solver, stage.level)
         if not self.history:
-            self.rejected = unusable_radiographs(self.stream, level.radiographs)
+            self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
         # that one, its first steps would go astray.
         steps = self.solver.acceleration()
@@ -137,7 +140,7 @@ class CoarseToFine:
             started = time.perf_counter()
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(level, title=of)
-            wrong = outliers(found.correlation) & ~self.rejected
+            wrong = self.rejections.of(found.correlation) & ~self.rejected
             if not self.history and wrong.any():
                 # They were in the first volume: again without, or what they did to the others stays
                 # in the modes that data hardly see, a tenth of all that is left of random motion.
@@ -195,9 +198,11 @@ class CoarseToFine:
         Returns the plain step as lengths, and what was warned of.
         """
         self.registered = found
-        self.rejected = outliers(found.correlation)
+        self.rejected = self.rejections.of(found.correlation)
         there = self._held(self.motion.then(found.motion), found, level)
-        self.found = from_neighbours(there, self.rejected).normalised()
+        self.found = self.rejections.settled(
+            self.motion, there, self.rejected, first=not self.history
+        ).normalised()
         there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
         step = self.steps.step(self.motion, there)
         valid_views = np.abs(step[:2, ~self.rejected])
@@ -239,11 +244,13 @@ class CoarseToFine:
         level, update = self.last
         arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
         arrays |= {"rejected": self.rejected, "update": update}
+        arrays["accepted"] = self.rejections.accepted
         values = {
             "position": (stage, done),
             "history": history_values(self.history),
             "level": level,
             "fresh": self.fresh,
+            "reasons": list(self.rejections.reasons.items()),
         }
         self.checkpoint.save(
             finished(self.history), values, arrays | registered_arrays(self.registered)
@@ -255,6 +262,8 @@ class CoarseToFine:
         self.motion = motion_from(arrays, "motion", cause)
         self.found = motion_from(arrays, "found", cause)
         self.rejected, self.fresh = arrays["rejected"], values["fresh"]
+        self.rejections.accepted = arrays["accepted"].astype(np.bool_)
+        self.rejections.reasons = {int(view): reason for view, reason in values["reasons"]}
         self.last = values["level"], arrays["update"]
         self.history = history_from(values["history"])
         registered = registered_from(arrays)
@@ -276,6 +285,8 @@ class CoarseToFine:
 
     def result(self) -> AlignmentResult:
         """Return what the iterations so far gave."""
+        for finding in self.rejections.findings(self.rejected):
+            finding.warn()
         return AlignmentResult.of(
             self.motion,
             self.history,

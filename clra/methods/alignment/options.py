@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from clra.errors import InputError
-from clra.methods.alignment.acceleration import Anderson
 from clra.methods.alignment.reprojection import SPREAD, is_large, registration_for
+from clra.methods.alignment.steps.acceleration import Anderson
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan

@@ -1,10 +1,13 @@
 """Views that are rejected: blank, saturated, or not of this sample."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
+from clra.findings import Finding
 from clra.model.motion import Motion
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
@@ -20,6 +23,11 @@ _DEVIATIONS, _LEAST, _LACK = 5.0, 0.1, 10.0
 # from the others' by this part of it: the noise of a dark frame leaves streaks in the first volume
 # that cost twice the error of all other views; a wrong frame hardly shows.
 _ODD = 0.3
+# Why a view is rejected.
+_DARK = "dark, no beam reached the detector or something was in its way"
+_BLANK = "blank or saturated, it shows little of the sample"
+_UNLIKE = "brighter or of another contrast than the others"
+_FOREIGN = "no fit to the volume of the others: another sample, place or angle"
 # Neighbours in time that the ends of a scan, which look past the sample, are compared with.
 _NEIGHBOURS = 9
 # Views that take over the weight of one that is left out: those around it on a space-filling
@@ -29,7 +37,88 @@ _NEIGHBOURS = 9
 _NEIGHBOURS, _MOST = 6, 1.0
 
 
-def unusable_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
+class Rejections:
+    """Which views are rejected in the course of an alignment, and why.
+
+    Parameters
+    ----------
+    views : int
+        Number of views.
+    excluded : iterable of int
+        Views that the user excludes.
+
+    Attributes
+    ----------
+    reasons : dict of int to str
+        Why a view's pixels alone reject it.
+    accepted : ndarray of bool, (views,)
+        Whether a registration of the view was accepted so far.
+    """
+
+    def __init__(self, views: int, excluded: Iterable[int] = ()) -> None:
+        self.excluded = _marked(excluded, views)
+        self.reasons: dict[int, str] = {}
+        self.accepted = np.zeros(views, np.bool_)
+
+    def first(self, stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
+        """Return the views that are rejected before anything is registered, (views,)."""
+        self.reasons = unusable_radiographs(stream, radiographs)
+        return self.excluded | _marked(self.reasons, len(self.excluded))
+
+    def of(self, correlation: Floats) -> NDArray[np.bool_]:
+        """Return the views that are rejected for their correlations, or excluded."""
+        return self.excluded | outliers(correlation)
+
+    def settled(
+        self, before: Motion, after: Motion, rejected: NDArray[np.bool_], *, first: bool
+    ) -> Motion:
+        """Return the motion after a registration in which some views were rejected.
+
+        A view whose registration was accepted before stays where it was: that is closer than what
+        lies between its neighbours, if the motion is no smooth one. Others get the latter. What the
+        first registration accepts, with a volume that is blurred, is not relied on.
+        """
+        kept = rejected & self.accepted
+        motion = from_neighbours(after, rejected & ~kept)
+        if not first:
+            self.accepted |= ~rejected
+        return motion if not kept.any() else _mixed(before, motion, kept)
+
+    def findings(self, rejected: NDArray[np.bool_]) -> list[Finding]:
+        """Return what to tell users of the views that are rejected in the end, a reason each."""
+        views: dict[str, list[int]] = {}
+        for view in np.flatnonzero(rejected).tolist():
+            reason = _FOREIGN if not self.excluded[view] else "excluded by the user"
+            views.setdefault(self.reasons.get(view, reason), []).append(view)
+        return [
+            Finding(
+                "rejected-views",
+                f"{'views' if len(which) > 1 else 'view'} {', '.join(map(str, which))} rejected: "
+                f"{reason}",
+                severity="info",
+                measured={"views": " ".join(map(str, which)), "reason": reason},
+            )
+            for reason, which in views.items()
+        ]
+
+
+def _marked(which: Iterable[int], views: int) -> NDArray[np.bool_]:
+    marked = np.zeros(views, np.bool_)
+    marked[list(which)] = True
+    return marked
+
+
+def _mixed(motion: Motion, others: Motion, which: NDArray[np.bool_]) -> Motion:
+    """Take the motion of some views, and others' of the rest."""
+    return Motion(
+        shift_u=np.where(which, motion.shift_u, others.shift_u),
+        shift_v=np.where(which, motion.shift_v, others.shift_v),
+        magnification=np.where(which, motion.magnification, others.magnification),
+        cause=others.cause,
+    )
+
+
+def unusable_radiographs(stream: Stream, radiographs: Radiographs) -> dict[int, str]:
     """Find blank, dark and saturated radiographs by their pixels alone.
 
     Parameters
@@ -41,15 +130,23 @@ def unusable_radiographs(stream: Stream, radiographs: Radiographs) -> NDArray[np
 
     Returns
     -------
-    ndarray of bool, (views,)
-        Where the mean or the standard deviation of the pixels is far from those of all views and
-        from those of the views before and after as well. Fewer than half of them.
+    dict of int to str
+        Views whose mean or standard deviation of the pixels is far from those of all views and from
+        those of the views before and after as well, and what they are. Fewer than half of them.
     """
     views = radiographs.shape[0]
     sums = np.empty((2, views))
     for chunk in stream.chunks(views, radiographs.view_bytes):
         sums[:, chunk] = sums_of(radiographs.read(chunk))
-    return odd(sums)
+    means, deviations = np.median(sums, axis=1)
+    return {
+        int(view): _DARK
+        if sums[0, view] > means
+        else _BLANK
+        if sums[1, view] < deviations
+        else _UNLIKE
+        for view in np.flatnonzero(odd(sums))
+    }
 
 
 def sums_of(images: NDArray[np.float32]) -> Floats:

@@ -1,6 +1,7 @@
 """What an alignment returns."""
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
@@ -269,6 +270,8 @@ class AlignmentResult:
 
 def _same(one: Any, other: Any) -> bool:
     """Whether two values of a field are equal; NaN, not estimated, equals itself."""
+    if hasattr(one, "as_dict") and hasattr(other, "as_dict"):
+        return json.dumps(one.as_dict()) == json.dumps(other.as_dict())  # NaN equals NaN there
     if not (isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
         return type(one) is type(other) and bool(one == other)
     numbers = one.dtype.kind == "f" and other.dtype.kind == "f"

@@ -243,6 +243,11 @@ def identity(
 ) -> dict[str, Any]:
     """Return by what a state is known to belong to a call; see :meth:`Checkpoint.begin`."""
     masks = [] if scan.mask is None else [scan.mask]
+    corrected = None
+    if scan.corrections is not None:
+        arrays = (scan.corrections.bad, scan.corrections.rings)
+        known = fingerprint(*(array for array in arrays if array is not None))
+        corrected = f"{scan.corrections.contents()} {known}"
     moved = None
     if motion is not None:
         columns = (motion.shift_u, motion.shift_v, motion.magnification)
@@ -251,6 +256,7 @@ def identity(
         "scan": scan.checksum(),
         "geometry": fingerprint(scan.geometry.to_astra(), *masks),
         "grid": [*grid.shape, grid.voxel_size, *grid.centre],
+        "corrections": corrected,
         "motion": moved,
         "valid_views": None if valid_views is None else fingerprint(valid_views),
         **{name: _plain(value) for name, value in options.items()},

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clra.errors import Cancelled, InputError
 from clra.findings import Finding
 from clra.methods.alignment.limits import far_motion, lost_features, warned
-from clra.methods.alignment.rejected_views import from_neighbours, outliers, unusable_radiographs
+from clra.methods.alignment.rejected_views import Rejections, from_neighbours
 from clra.methods.alignment.reprojection import Registered, with_margin
 from clra.methods.alignment.result import AlignmentResult, Iteration
 from clra.methods.execution.checkpoint import Checkpoint, Saved
@@ -167,6 +167,8 @@ class _Run:
         points = sample_points(self.grid)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
+        excluded = () if self.scan.corrections is None else self.scan.corrections.excluded
+        self.rejections = Rejections(self.scan.views, excluded)
         self._levels: dict[int, MultigridLevel] = {}
 
     def cycles(self, most: int) -> None:
@@ -232,13 +234,13 @@ class _Run:
         if self.done.volume is not None:
             return level.brought(self.done.volume)
         if self.align:
-            odd = unusable_radiographs(self.stream, level.radiographs)
+            odd = self.rejections.first(self.stream, level.radiographs)
             self.done = replace(self.done, rejected=odd)
         return level.first(self.done.motion, ~self.done.rejected)
 
     def _moved(self, found: Registered) -> ImgrState:
         """Append what was found to the motion, and tell which views are rejected."""
-        rejected = outliers(found.correlation)
+        rejected = self.rejections.of(found.correlation)
         there = from_neighbours(self.done.motion.then(found.motion), rejected)
         motion = self.shift_gauge.anchored(there, self.start) if self.anchor else there
         return replace(
@@ -289,6 +291,8 @@ class _Run:
         """Return what was found of the motion, if anything was registered."""
         if self.done.registered is None or self.done.found is None:
             return None
+        for finding in self.rejections.findings(self.done.rejected):
+            finding.warn()
         return AlignmentResult.of(
             self.done.motion,
             self.done.history,

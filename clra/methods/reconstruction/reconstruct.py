@@ -14,7 +14,7 @@ from clra.methods.alignment.result import AlignmentResult
 from clra.methods.correction import corrected
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of
 from clra.methods.execution.several_devices import Work, on_devices
-from clra.methods.preparation import prepared
+from clra.methods.preparation import prepared, used_views
 from clra.methods.reconstruction import iterative
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.imgr_state import ImgrStep
@@ -74,8 +74,7 @@ def reconstruct(
         and double helices; ordered subsets for counted photons (`osem_tr`); or the paper's
         Algorithm 3, which solves the lowest resolution by these and corrects the higher ones once.
     grid : VolumeGrid, optional
-        Where to reconstruct; by default the whole field of view
-        (:func:`clra.model.grid.default_grid`).
+        Where to reconstruct; by default :func:`clra.model.grid.default_grid`.
     motion : Motion, optional
         Of the radiographs, absorbed into the geometry, so that nothing is resampled; but
         "katsevich" needs ideal rows and resamples each radiograph once.
@@ -98,19 +97,18 @@ def reconstruct(
         the iterative methods return what their finished passes or levels gave, with a warning.
     checkpoint : path-like, optional
         Folder that keeps each finished pass of "osem-tr", level of "imgr" and iteration of an
-        alignment, so that an interruption of any kind loses none; removed at success. A
-        :class:`Checkpoint` is left to who made it.
+        alignment; removed at success. A :class:`Checkpoint` is left to who made it.
     resume : bool
         Go on from what the checkpoint holds.
     max_device_memory, max_host_memory : int, optional
-        Bytes that may be used, see `Stream`. The volume that is returned comes on top:
-        :func:`reconstruct_into` takes one larger than the memory.
+        Bytes that may be used. The volume that is returned comes on top: :func:`reconstruct_into`
+        takes one larger than the memory.
     corrections : CorrectionOptions, optional
         Defects of the radiographs to look for and correct first; by default the defaults of these.
     binning : int
         Average radiographs over this many rows and columns first, but align the whole ones.
     roi, voxel_size
-        Of the grid if none is given, see :func:`clra.model.grid.volume_grid`.
+        Of the grid if none is given, as :func:`clra.model.grid.volume_grid` takes them.
     window : {"ram-lak", "shepp-logan", "hann"}
         Of the ramp filter of "fbp": the latter two trade resolution for less noise.
 
@@ -235,6 +233,7 @@ def reconstruct_into(
     with collected() as findings:
         devices = usable_devices(device, progress)
         scan = prepared(scan, corrections, progress=progress)
+        valid_views = used_views(scan, valid_views)
         motion = None if motion is None else motion.about(*scan.window_offset)
         scan = scan.cropped()
         small = binned_scan(scan, binning)

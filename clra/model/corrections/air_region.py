@@ -112,6 +112,9 @@ class AirStatistics:
         brightest = np.quantile(level, 0.25, axis=1)
         within = max(_AGREEMENT, _OF_CONTRAST * contrast) + 4 * noise / np.sqrt(area)
         air = (np.abs(level - brightest[:, None]) < within).mean(axis=0) >= _VIEWS
+        # Outer and inner tile at one height: the rim of a truncated sample rises inwards.
+        halves = air.reshape(2, 2, _ALONG).all(axis=1)
+        air = np.repeat(halves[:, None], 2, axis=1).ravel()
         if air.reshape(2, -1).mean(axis=1).max() < _TILES:
             return None
         levels = np.sort(np.abs(np.median(level[:, air], axis=1)))

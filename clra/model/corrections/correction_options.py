@@ -28,6 +28,8 @@ class CorrectionOptions:
     beam_hardening : tuple of float
         Coefficients c1, c2, ... of a calibration, by which line integrals p become
         ``p + c1 p^2 + c2 p^3 + ...``; none by default.
+    exclude : tuple of int
+        Views that are not to be used, from 0.
     """
 
     bad_pixels: bool = True
@@ -35,6 +37,7 @@ class CorrectionOptions:
     intensity: bool = True
     rings: bool = False
     beam_hardening: tuple[float, ...] = ()
+    exclude: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, self.beam_hardening)):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.errors import InputError
+from clra.findings import Finding
 from clra.model.bad_pixels import Patches
 from clra.model.corrections.air_region import AirRegion
 from clra.model.corrections.zingers import replace_zingers
@@ -21,7 +24,7 @@ Mask = NDArray[np.bool_]
 class Corrections:
     """Corrections of line integrals p of a scan, in the order in which they are made.
 
-    Bad pixels are interpolated, zingers replaced, the line integral of the air in the view and the
+    Zingers are replaced, bad pixels interpolated, the line integral of the air in the view and the
     error of the pixel subtracted, and beam hardening undone by ``p + c1 p^2 + c2 p^3 + ...``.
 
     Parameters
@@ -36,6 +39,10 @@ class Corrections:
         Error of each pixel that is the same in all views.
     beam_hardening : tuple of float
         Coefficients c1, c2, ... of the polynomial.
+    excluded : tuple of int
+        Views that are not to be used.
+    findings : tuple of Finding
+        What was found in the radiographs.
     """
 
     zingers: bool = False
@@ -43,6 +50,12 @@ class Corrections:
     air: AirRegion | None = None
     rings: Floats | None = None
     beam_hardening: tuple[float, ...] = ()
+    excluded: tuple[int, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    def __str__(self) -> str:
+        """Return what is corrected, on a line of JSON."""
+        return json.dumps(self.contents())
 
     def check(self, shape: tuple[int, int], name: str) -> None:
         """Raise an InputError if an array does not fit a detector of (rows, columns)."""
@@ -70,10 +83,11 @@ class Corrections:
         pixels = pixels.copy()
         patches = self._patches
         for image in pixels:
-            if patches is not None:
-                patches.fill(image)
+            # Before a bad pixel gets a part of one.
             if self.zingers:
                 replace_zingers(image)
+            if patches is not None:
+                patches.fill(image)
             if self.air is not None:
                 image -= np.float32(self.air.level(image))
             if self.rings is not None:
@@ -81,6 +95,17 @@ class Corrections:
             if self.beam_hardening:
                 image[...] = linearised(image, self.beam_hardening)
         return pixels
+
+    def contents(self) -> dict[str, Any]:
+        """Return what is corrected, as plain values: for records of what was done."""
+        return {
+            "zingers": self.zingers,
+            "bad_pixels": 0 if self.bad is None else int(self.bad.sum()),
+            "intensity": [] if self.air is None else [list(tile) for tile in self.air.tiles],
+            "rings": self.rings is not None,
+            "beam_hardening": list(self.beam_hardening),
+            "excluded": list(self.excluded),
+        }
 
     @property
     def unreliable(self) -> Mask | None:

@@ -14,6 +14,7 @@ as dead if most of it, of all that the sample moves over, is insensitive in that
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,8 @@ _LINE = 0.6
 _FEW = 15
 # Standard deviation, for that of the mean image, below which a pixel counts as constant.
 _ROUNDING = 1e-4
+# Pixels that are worked on at a time: a dozen arrays of so many are needed.
+_BAND = 1 << 18
 # Fewest views that tell anything.
 FEWEST = 5
 
@@ -133,15 +136,20 @@ class DetectorStatistics:
 
     def moments(self) -> tuple[Floats, Floats]:
         """Return mean and variance, each (rows, columns)."""
-        low, high = self._low.astype(np.float64), self._high.astype(np.float64)
         count = self.views - 2
-        mean = (self._sum - low - high) / count
-        square = (self._squares - low**2 - high**2) / count - mean**2
-        # What rounding leaves of a constant is not a variance, nor is anything so far below what
-        # the image itself spans: a simulation of a round sample that stands still.
-        rounding = np.maximum(1e-12 * (self._squares / self.views), _ROUNDING**2 * mean.var())
-        variance = np.where(square > rounding, square, 0) * count / (count - 1)
-        return mean.astype(np.float32), variance.astype(np.float32)
+        mean, variance = np.empty((2, *self._sum.shape), np.float32)
+        for band in _bands(mean.shape):
+            low, high = self._low[band].astype(np.float64), self._high[band].astype(np.float64)
+            middle = (self._sum[band] - low - high) / count
+            square = (self._squares[band] - low**2 - high**2) / count - middle**2
+            # What rounding leaves of a constant is not a variance, ...
+            rounding = 1e-12 * (self._squares[band] / self.views)
+            mean[band] = middle
+            variance[band] = np.where(square > rounding, square, 0) * count / (count - 1)
+        # ... nor is anything so far below what the image itself spans: a simulation of a round
+        # sample that stands still.
+        variance[variance <= _ROUNDING**2 * mean.var(dtype=np.float64)] = 0
+        return mean, variance
 
     def find(self) -> BadPixels:
         """Find the bad pixels; none of fewer than five views."""
@@ -156,8 +164,15 @@ class DetectorStatistics:
         mean, variance = _filled(mean, rows, columns), _filled(variance, rows, columns)
         if min(mean.shape) < _SMALL:
             return BadPixels(known, rows, columns)
-        bad = known | self._insensitive(variance) | self._standing_out(mean, variance)
-        return BadPixels(bad, rows, columns)
+        weak = _WEAK * float(variance.mean())
+        least = self._least_excess(mean, variance)
+        halo = 2 * max(_NEAR)
+        for band in _bands(mean.shape):
+            wide = slice(max(0, band.start - halo), band.stop + halo)
+            found = self._insensitive(variance[wide], weak)
+            found |= self._standing_out(mean[wide], variance[wide], least)
+            known[band] |= found[band.start - wide.start :][: band.stop - band.start]
+        return BadPixels(known, rows, columns)
 
     @property
     def _least(self) -> float:
@@ -167,21 +182,19 @@ class DetectorStatistics:
         n = self.degrees_of_freedom
         return min(_INSENSITIVE, float(f.ppf(_CHANCE, n, n)))
 
-    def _insensitive(self, variance: Floats) -> Mask:
+    def _insensitive(self, variance: Floats, weak: float) -> Mask:
         found = np.zeros(variance.shape, np.bool_)
-        weak = _WEAK * float(variance.mean())
         # An edge that passed one neighbour and not the other counts in few views.
         rank = 0 if self.views < _FEW else 1
         for distance in _NEAR:
             lacking = np.ones_like(found)
             for step in _DIRECTIONS:
-                lowest = np.sort(_neighbours(variance, step, distance), axis=0)[rank]
+                lowest = _ranked(variance, step, distance)[rank]
                 lacking &= (variance < self._least * lowest) & (lowest > weak)
             found |= lacking
         return found
 
-    def _standing_out(self, mean: Floats, variance: Floats) -> Mask:
-        least = self._least_excess(mean, variance)
+    def _standing_out(self, mean: Floats, variance: Floats, least: float) -> Mask:
         found = np.zeros(mean.shape, np.bool_)
         for distance in _NEAR:
             excess = np.full(mean.shape, np.inf, np.float32)
@@ -191,7 +204,7 @@ class DetectorStatistics:
                 beyond, width, sign = _excess(mean, step, distance)
                 excess, spread = np.minimum(excess, beyond), np.maximum(spread, width)
                 signs += sign
-                noise = np.maximum(noise, np.sort(_neighbours(variance, step, distance), axis=0)[2])
+                noise = np.maximum(noise, _ranked(variance, step, distance)[2])
             error = np.sqrt((variance + noise) / (self.views - 2))
             usual = _USUAL * float(np.quantile(np.maximum(excess, 0), 0.9))
             enough = np.maximum(np.maximum(self._deviations * error, spread), max(least, usual))
@@ -206,13 +219,16 @@ class DetectorStatistics:
         least = _EXTREME * self._least_excess(mean, variance)
         best = np.zeros(columns)
         for distance in _NEAR:
+            lacking, telling, extreme = np.zeros((3, columns))
+            for band in _bands(mean.shape):
+                varies = variance[band]
+                beside = _ranked(varies, (0, 1), distance)[1]
+                lacking += (varies < self._least * beside).sum(axis=0)
+                telling += (beside > 0).sum(axis=0)
+                beyond, width, sign = _excess(mean[band], (0, 1), distance)
+                extreme += ((beyond > np.maximum(least, _EXTREME * width)) * sign).sum(axis=0)
+            part = np.maximum(lacking / np.maximum(telling, rows / 8), np.abs(extreme) / rows)
             inside = slice(2 * distance, columns - 2 * distance)
-            beside = np.sort(_neighbours(variance, (0, 1), distance), axis=0)[1]
-            lacking = variance < self._least * beside
-            part = lacking.sum(axis=0) / np.maximum((beside > 0).sum(axis=0), rows / 8)
-            beyond, width, sign = _excess(mean, (0, 1), distance)
-            extreme = (beyond > np.maximum(least, _EXTREME * width)) * sign
-            part = np.maximum(part, np.abs(extreme.sum(axis=0)) / rows)
             best[inside] = np.maximum(best, part)[inside]
         for border in (slice(None), slice(None, None, -1)):
             best[border][:4] = np.maximum(
@@ -252,16 +268,32 @@ class DetectorStatistics:
         return _CONTRAST * float(np.std(mean) + np.sqrt(np.median(variance)))
 
 
-def _neighbours(values: Floats, step: tuple[int, int], distance: int) -> Floats:
-    """Four neighbours on a line through each pixel, (4, rows, columns); beyond borders mirrored."""
+def _bands(shape: tuple[int, ...]) -> list[slice]:
+    """Cut rows into bands of limited size."""
+    rows, columns = shape
+    count = -(-rows * columns // _BAND)
+    edges = [rows * k // count for k in range(count + 1)]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+def _ranked(values: Floats, step: tuple[int, int], distance: int) -> tuple[Floats, ...]:
+    """Sort the four neighbours on a line through each pixel; beyond borders they are mirrored."""
     reach = 2 * distance
     padded = np.pad(values, reach, mode="reflect" if min(values.shape) > reach else "symmetric")
     rows, columns = values.shape
-    return np.stack(
-        [
-            padded[reach + k * step[0] :, reach + k * step[1] :][:rows, :columns]
-            for k in (-reach, -distance, distance, reach)
-        ]
+    a, b, c, d = (
+        padded[reach + k * step[0] :, reach + k * step[1] :][:rows, :columns]
+        for k in (-reach, -distance, distance, reach)
+    )
+    # A sorting network: ten times as fast as sorting.
+    low, other_low = np.minimum(a, b), np.minimum(c, d)
+    high, other_high = np.maximum(a, b), np.maximum(c, d)
+    inner, other_inner = np.maximum(low, other_low), np.minimum(high, other_high)
+    return (
+        np.minimum(low, other_low),
+        np.minimum(inner, other_inner),
+        np.maximum(inner, other_inner),
+        np.maximum(high, other_high),
     )
 
 
@@ -270,14 +302,11 @@ def _excess(mean: Floats, step: tuple[int, int], distance: int) -> tuple[Floats,
 
     One of four neighbours on either side of their range does not count.
     """
-    near = np.sort(_neighbours(mean, step, distance), axis=0)
-    above, below = mean - near[2], near[1] - mean
-    return (
-        np.maximum(above, below),
-        # Of three of them: two may be alike by chance, such as on either side of a round sample.
-        np.minimum(near[3] - near[1], near[2] - near[0]),
-        np.where(above > below, np.float32(1), np.float32(-1)),
-    )
+    first, second, third, fourth = _ranked(mean, step, distance)
+    above, below = mean - third, second - mean
+    side = np.sign(above - below)
+    # Of three of them: two may be alike by chance, such as on either side of a round sample.
+    return np.maximum(above, below), np.minimum(fourth - second, third - first), side
 
 
 def _filled(values: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:

@@ -96,12 +96,13 @@ class Blocks:
 
 
 class CpuForward:
-    """Forward projection."""
+    """Forward projection, or with MOMENT among the definitions the two integrals of each ray."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, defines: Mapping[str, object] | None = None) -> None:
         self._layout = layout
         kernels = ("forward_columns", "forward_tilted")
-        self._project = Blocks(layout, "forwardproject", kernels, layout.detector[1], _LINE)
+        rows = layout.detector[1]
+        self._project = Blocks(layout, "forwardproject", kernels, rows, _LINE, defines)
         nx, ny, nz = layout.sizes
         planes = max(layout.sizes)
         thick = max(_LEAST_PLANES, _PART_BYTES // (4 * nz * max(nx, ny)))
@@ -117,9 +118,21 @@ class CpuForward:
         wait_for: Sequence[cl.Event],
     ) -> cl.Event:
         """Project into lines, part of the volume after part, and transpose these."""
+        return self.integrals(queue, (projections,), volume, views, accumulate, wait_for)
+
+    def integrals(
+        self,
+        queue: cl.CommandQueue,
+        outputs: Sequence[Array],
+        volume: Array,
+        views: slice,
+        accumulate: bool,
+        wait_for: Sequence[cl.Event],
+    ) -> cl.Event:
+        """Do so with one image a view, or two; lines of the second follow all of the first."""
         layout = self._layout
-        for first, last in layout.batches(views.stop - views.start):
-            lines = layout.scratch_projections(last - first)
+        for first, last in layout.batches(views.stop - views.start, len(outputs)):
+            lines = layout.scratch_projections(len(outputs) * (last - first))
             for planes in self._parts:
                 event = self._project(
                     queue,
@@ -132,8 +145,11 @@ class CpuForward:
                     wait_for=wait_for,
                 )
                 wait_for = [event]
-            event = layout.scatter_projections(queue, projections[first:last], accumulate, wait_for)
-            wait_for = layout.last = [event]
+            for index, out in enumerate(outputs):
+                event = layout.scatter_projections(
+                    queue, out[first:last], accumulate, wait_for, index * (last - first)
+                )
+                wait_for = layout.last = [event]
         return event
 
 

@@ -138,9 +138,9 @@ class Layout:
         """Views that one launch treats."""
         return max(self._least, self._bytes // (4 * self._view_elements))
 
-    def batches(self, count: int) -> Iterator[tuple[int, int]]:
-        """Cut `count` views into runs that fit the scratch."""
-        runs = -(-count // self._most)
+    def batches(self, count: int, images: int = 1) -> Iterator[tuple[int, int]]:
+        """Cut `count` views, of some images each, into runs that fit the scratch."""
+        runs = -(-count // max(1, self._most // images))
         for run in range(runs):
             yield count * run // runs, count * (run + 1) // runs
 
@@ -166,10 +166,11 @@ class Layout:
         projections: Array,
         accumulate: bool,
         wait_for: Sequence[cl.Event],
+        skipped: int = 0,
     ) -> cl.Event:
-        """From scratch to the caller's projections."""
+        """From scratch, behind the lines of `skipped` views, to the caller's projections."""
         columns, rows, pitch = self.detector
-        lines = self.scratch_projections(len(projections))[:, :, _PAD:]
+        lines = self.scratch_projections(skipped + len(projections))[skipped:, :, _PAD:]
         return self._transpose(
             queue,
             Planes(projections, rows * columns, columns, rows, columns),

@@ -10,6 +10,7 @@ from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.view_selection import runs, views_that_see
+from clra.ops.projection.moment_projector import MomentProjector
 from clra.ops.projection.projector import BackProjector, ForwardProjector
 from clra.ops.streaming.memory import Reused
 from clra.ops.streaming.stream import Stream
@@ -102,8 +103,8 @@ class SlabProjector:
         scratch = Reused(stream.memory)
         slabs = volume.slabs
         self._seeing = [views_that_see(geometry, slab) for slab in slabs]
-        self._projectors = [
-            ForwardProjector(
+        self._projectors: list[Any] = [
+            self._PROJECTOR(
                 stream.context,
                 geometry,
                 slab,
@@ -113,6 +114,8 @@ class SlabProjector:
             )
             for slab in slabs
         ]
+
+    _PROJECTOR: type[ForwardProjector | MomentProjector] = ForwardProjector
 
     def __call__(self, projections_out: Array, views: slice) -> cl.Event:
         """Project some views, on the stream's queue.
@@ -124,23 +127,45 @@ class SlabProjector:
         views : slice
             The n successive views of the geometry. Slabs that none of them sees are not fetched.
         """
+        return self._over_slabs((projections_out,), views)
+
+    def _project(
+        self, index: int, outputs: tuple[Array, ...], views: slice, accumulate: bool
+    ) -> cl.Event:
+        """Project a slab."""
+        volume, projector = self._volume.get(index), self._projectors[index]
+        event: cl.Event = projector(
+            self._queue, *outputs, volume, views=views, accumulate=accumulate
+        )
+        return event
+
+    def _over_slabs(self, outputs: tuple[Array, ...], views: slice) -> cl.Event:
+        """Add up what the slabs give."""
         seen = [
             index for index, views_seeing in enumerate(self._seeing) if views_seeing[views].any()
         ]
         if not seen:
-            projections_out.fill(0.0, queue=self._queue)
+            for out in outputs:
+                out.fill(0.0, queue=self._queue)
             return cl.enqueue_marker(self._queue)
         for index in seen:
-            event = self._projectors[index](
-                self._queue,
-                projections_out,
-                self._volume.get(index),
-                views=views,
-                accumulate=index != seen[0],
-            )
+            event = self._project(index, outputs, views, index != seen[0])
             if len(seen) > 1:
                 event.wait()  # the slab is let go
         return event
+
+
+class SlabMoments(SlabProjector):
+    """Integrals of a volume and of the volume over the depth, slab by slab.
+
+    As :class:`SlabProjector`, with :class:`~clra.ops.projection.moment_projector.MomentProjector`.
+    """
+
+    _PROJECTOR = MomentProjector
+
+    def moments(self, projections_out: Array, over_depth_out: Array, views: slice) -> cl.Event:
+        """Project some views; arrays as for `MomentProjector.moments`."""
+        return self._over_slabs((projections_out, over_depth_out), views)
 
 
 class SlabAdjoint:

@@ -1,5 +1,6 @@
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -7,10 +8,13 @@ import pytest
 
 from clra.app.report.comparison import Comparison, MatchedView, Pair
 from clra.app.report.html_report import render, write_report
+from clra.app.report.page import embedded
 from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
-from clra.methods.alignment.agreement import Agreement
+from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.agreement import Agreement
+from clra.methods.assessment.quality import Quality
 from clra.model.motion import Motion
 
 
@@ -25,12 +29,13 @@ class Checker(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         values = dict(attrs)
-        assert tag not in ("script", "link", "iframe")
+        assert tag not in ("link", "iframe")
+        assert tag != "script" or "src" not in values
         assert not any(v and v.startswith(("http:", "https:", "//")) for v in values.values())
         if tag == "img":
             self.images.append(values)
         self.captions += tag == "figcaption"
-        if tag not in ("img", "meta", "br"):
+        if tag not in ("img", "meta", "br", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -63,18 +68,21 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page):
     checker = Checker()
     checker.feed(page)
     assert checker.open == []
-    assert len(checker.images) == checker.captions == 8
+    # Before and after of three slices, four pictures of a view, the convergence; three charts.
+    assert (len(checker.images), checker.captions) == (11, 8)
     for image in checker.images:
         kind, data = re.fullmatch(r"data:image/(.+);base64,(.+)", image["src"]).groups()
         content = base64.b64decode(data, validate=True)
-        assert content.startswith(b"\x89PNG" if kind == "png" else b"<?xml")
+        assert content.startswith({"png": b"\x89PNG", "jpeg": b"\xff\xd8"}.get(kind, b"<?xml"))
         assert image["alt"]
 
 
 def test_the_page_tells_all_there_is(page, record):
     for part in (
         "Alignment of tiny",
-        "<p>few features</p>\n<p>3 &lt; 4 views</p>",
+        '<div class="told warning"><div class="what">few features</div></div>',
+        '<div class="told warning"><div class="what">3 &lt; 4 views</div></div>',
+        "No verdict",
         "Correction of each radiograph",
         "the inverse of the estimated motion",
         "Convergence",
@@ -102,6 +110,24 @@ def test_the_page_says_what_the_radiographs_alone_tell(page):
         assert number in section
 
 
+@pytest.mark.parametrize("verdict", ["good", "doubtful", "failed"])
+def test_the_verdict_and_its_reasons_come_first(record, verdict):
+    reason = Finding("held-out-shift", "views lie beside", "more iterations may help")
+    quality = Quality(
+        verdict, (reason,) if verdict != "good" else (), shift_after=(0.1, 0.2, 0), error=0.25
+    )
+    page = render(Findings(replace(record, quality=quality)))
+    body = page.partition("</header>")[2]
+    assert body.lstrip().startswith(f'<div class="told {verdict} verdict">')
+    first = body.partition('<div class="card')[0]
+    assert ("<li>views lie beside: more iterations may help</li>" in first) == (verdict != "good")
+    assert "0.10, 0.20" in first and "0.25" in first
+
+
+def test_what_is_embedded_cannot_end_its_element():
+    assert "</script" not in embedded({"x": "</script><b>"}).removesuffix("</script>")
+
+
 def test_text_from_files_is_escaped(page):
     assert "clra align &lt;scan&gt;.nxs" in page
     assert "<scan>" not in page
@@ -117,7 +143,7 @@ def test_a_motion_alone_makes_a_page(tmp_path):
     bare = AlignmentResult.from_motion(Motion.identity(5))
     write_report(tmp_path / "r.html", Findings(bare))
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "--scan SCAN" in page and "Convergence" not in page and "Warnings" not in page
+    assert "--scan SCAN" in page and "Convergence" not in page and "told warning" not in page
     assert [file.name for file in tmp_path.iterdir()] == ["r.html"]
 
 

@@ -43,7 +43,7 @@ def test_outside_the_groups_the_nearest_flat_holds() -> None:
     np.testing.assert_allclose(found[:][:, 0, 0], [0.1, 0.05], rtol=1e-6)
 
 
-def test_dead_pixels_get_the_median_beside_them() -> None:
+def test_dead_pixels_are_interpolated() -> None:
     counts = frames()
     ramp = np.arange(13.0)
     counts[2:] = 600 + 10 * ramp
@@ -52,7 +52,9 @@ def test_dead_pixels_get_the_median_beside_them() -> None:
     found = radiographs(counts)
     beside = np.sort((500 + 10 * ramp[[5, 5, 5, 6, 6, 7, 7, 7]]) / 1000)
     np.testing.assert_allclose(found[0][4, 6], np.median(beside), rtol=1e-6)
-    assert found.notes == ("1 dead pixels (flat not above dark) filled from beside",)
+    assert found.notes == (
+        "1 bad pixels (saturated or dim in a flat field) interpolated from their neighbours",
+    )
     assert found.mask is None
 
 
@@ -89,28 +91,40 @@ def test_bad_flats_are_found_at_once() -> None:
         radiographs(counts)
 
 
-def test_saturated_frames() -> None:
+def test_saturated_frames_are_told_of_and_read() -> None:
     counts = frames(4).astype(np.uint16)
-    counts[3, 0, 0] = 65535
+    counts[3, 0, :5] = 65535
     found = radiographs(counts)
-    with pytest.warns(UserWarning, match="frame 3 with 1 pixels at 65535 counts: saturated"):
+    with pytest.warns(UserWarning, match="frame 3 with 5 pixels at 65535 counts: saturated"):
         found[0:4]
     found[0:4]  # said once: a second warning would be an error here
-    counts[4, 0, :2] = 65535
-    found[0:1]
-    with pytest.raises(InputError, match=r"frame 4 with 2 pixels at 65535 counts.* at most 1%"):
-        found[1:4]
 
 
-def test_declared_saturation_and_saturated_flats() -> None:
+def test_pixels_saturated_in_a_flat_are_interpolated() -> None:
     counts = frames(4)
-    counts[5, 3] = 4095.0
+    counts[1, 3, 4] = counts[1, :, 9] = 4095.0
     found = radiographs(counts, saturation=4095.0)
-    with pytest.raises(InputError, match="frame 5 with 13 pixels at 4095 counts"):
-        found[:]
+    np.testing.assert_allclose(found[:], 0.5, rtol=1e-6)
+    assert found.notes[0].startswith("12 bad pixels")
     counts[1] = 4095.0
-    with pytest.raises(InputError, match="frame 1 with 143 pixels at 4095"):
+    with pytest.raises(InputError, match="flat frame 1 with 143 pixels at 4095"):
         radiographs(counts, saturation=4095.0)
+
+
+def test_pixels_that_are_dim_in_a_flat_are_interpolated() -> None:
+    counts = frames()
+    counts[1, 5, 5] = 105.0  # of 1000 above the dark
+    counts[2:, 5, 5] = 700.0
+    np.testing.assert_allclose(radiographs(counts)[:], 0.5, rtol=1e-6)
+
+
+def test_a_plateau_below_the_largest_number_is_told_of() -> None:
+    random = np.random.default_rng(2)
+    counts = random.normal(3900, 150, (5, 40, 40)).round()
+    counts[0] = 100
+    radiographs(counts)  # noise alone
+    with pytest.warns(UserWarning, match=r"flat frame 1 with \d+ pixels at exactly 4000 counts"):
+        radiographs(np.minimum(counts, 4000))
 
 
 def test_normalised_frames_pass_unchanged() -> None:

@@ -314,3 +314,39 @@ def test_synchrotron_scan(data: Path, tmp_path: Path) -> None:
     lag = np.correlate(first, last[::-1], "full").argmax() - 159
     axis = scan.geometry.project([[0.0, 0.0, 0.0]])[0, 0, 0]
     assert axis - 79.5 == pytest.approx(lag / 2, abs=1.0)
+
+
+def test_a_detector_on_its_side(tmp_path: Path, counts: np.ndarray) -> None:
+    """Frames turned by 90 degrees give the scan of upright ones, whose right end is the top."""
+    tifffile.imwrite(tmp_path / "upright.tif", counts, photometric="minisblack")
+    sideways = np.rot90(counts, -1, axes=(1, 2))
+    np.testing.assert_array_equal(sideways[:, :, -1], counts[:, 0])  # right column: top row
+    tifffile.imwrite(tmp_path / "sideways.tif", sideways, photometric="minisblack")
+    scans = []
+    for name, axis, pixel in (("upright", "vertical", (0.5, 0.4)),
+                              ("sideways", "horizontal", (0.4, 0.5))):  # fmt: skip
+        out = tmp_path / f"{name}.nxs"
+        options: dict[str, Any] = {**SCANNER, "pixel_size": pixel, "axis": axis}
+        import_frames(out, tmp_path / f"{name}.tif", "0:300:11", **options)
+        scans.append(read_scan(out, white=1000.0))
+    one, other = scans
+    np.testing.assert_array_equal(one.read(0, VIEWS), other.read(0, VIEWS))
+    np.testing.assert_allclose(one.geometry.to_astra(), other.geometry.to_astra(), atol=1e-12)
+    with pytest.raises(InputError, match="--axis: axis: found 'tilted'"):
+        import_frames(tmp_path / "x.nxs", tmp_path / "upright.tif", "0:300:11", axis="tilted",
+                      **SCANNER)  # fmt: skip
+
+
+def test_excluded_radiographs_are_marked(tmp_path: Path, counts: np.ndarray) -> None:
+    tifffile.imwrite(tmp_path / "stack.tif", counts, photometric="minisblack")
+    out = tmp_path / "scan.nxs"
+    import_frames(out, tmp_path / "stack.tif", "0:300:11", exclude=(2, 9), **SCANNER)
+    with h5py.File(out) as file:
+        key = file["entry/instrument/detector/image_key"][()]
+    assert np.flatnonzero(key == 3).tolist() == [2, 9]
+    scan = read_scan(out, white=1000.0)
+    assert scan.views == VIEWS - 2
+    left = np.delete(counts, [2, 9], axis=0)
+    np.testing.assert_allclose(scan.read(0, 9), -np.log(left / 1000), atol=1e-5)
+    with pytest.raises(InputError, match="exclude: found view 11, expected some of 11 views"):
+        import_frames(out, tmp_path / "stack.tif", "0:300:11", exclude=(11,), **SCANNER)

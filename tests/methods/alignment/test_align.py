@@ -180,16 +180,17 @@ def test_interruption_keeps_what_was_finished(moved):
     assert caught.value.result.motion.views == VIEWS
 
 
-STEPS = ["reconstructing", "registering"]
-
-
 def test_progress_names_stage_and_counts(moved):
     seen = []
-    clra.align(moved.subset(slice(0, 40)), schedule="1QR", progress=seen.append)
+    clra.align(moved.subset(slice(0, 40)), schedule="1QR", progress=seen.append, quality=False)
     stages = list(dict.fromkeys(entry.stage for entry in seen))
     steps = [stage.rpartition(": ")[2] for stage in stages]
-    displacement = ["simulating", "sharpening", *(f"{step} what is simulated" for step in STEPS)]
-    assert steps[1:] == [*STEPS, *displacement]  # the latter because the images are small
+    volume = ["reconstructing", "simulating", "correcting"]  # with one Neumann term
+    assert steps == [
+        *("looking for defects", "reading radiographs, binned 4 x 4"),
+        *(*volume, "registering"),
+        *(*volume, "registering what is simulated"),  # because the images are small
+    ]
     assert all(0 <= entry.done <= entry.total for entry in seen)
     assert all(dataclasses.astuple(entry)[1:] for entry in seen)
 
@@ -216,25 +217,18 @@ def test_one_view_cannot_be_aligned(moved):
 
 
 @pytest.mark.parametrize(
-    ("shape", "method", "message"),
+    ("shape", "options", "message"),
     [
-        (
-            (40, 90),
-            "ra",
-            "line: detector: found 40 x 90 pixels, 10 x 22 at QR, expected at least 16",
-        ),
-        (
-            (40, 90),
-            "imgr",
-            "line: detector: found 40 x 90 pixels, 10 x 22 at QR, expected at least",
-        ),
-        ((1, 90), "ra", "factor: found 4, expected at most 1 to bin 1 x 90 pixels"),
+        ((40, 90), {"schedule": "1QR"}, "found 40 x 90 pixels, 10 x 22 at QR, expected at least"),
+        ((40, 90), {"method": "imgr"}, "found 40 x 90 pixels, 10 x 22 at QR, expected at least"),
+        ((1, 90), {"schedule": "1QR"}, "factor: found 4, expected at most 1 to bin 1 x 90 pixels"),
+        ((1, 90), {}, "found 1 x 90 pixels, 1 x 90 at FR, expected at least 16"),
     ],
 )
-def test_detectors_too_small_for_a_level(shape, method, message):
+def test_detectors_too_small_for_a_level(shape, options, message):
     geometry = clra.circular(
         5, source_to_axis=9.0, source_to_detector=20.0, pixel_size=0.05, shape=shape
     )
     scan = clra.Scan(np.ones((5, *shape), np.float32), geometry, name="line")
     with pytest.raises(ValueError, match=message):
-        clra.align(scan, method=method)
+        clra.align(scan, **options)

@@ -5,6 +5,7 @@ import pytest
 
 import clra
 from clra.methods.alignment.rejected_views import (
+    Rejections,
     from_neighbours,
     neighbour_weights,
     outliers,
@@ -40,23 +41,49 @@ def _odd(images):
         shape=images.shape[1:],
     )
     stream = Stream()
-    return np.flatnonzero(
-        unusable_radiographs(stream, Radiographs(stream, clra.Scan(images, geometry), 1))
-    ).tolist()
+    return unusable_radiographs(stream, Radiographs(stream, clra.Scan(images, geometry), 1))
 
 
 def test_blank_dark_and_clipped_radiographs_are_odd_by_themselves():
     rows = np.random.default_rng(1).normal(1.0, 0.3, (60, 17, 19)).astype(np.float32)
     rows *= 1 + 0.2 * np.sin(2 * np.arange(60))[:, None, None]  # a sample that is not round
-    assert _odd(rows) == []
+    assert _odd(rows) == {}
     rows[3], rows[17], rows[40] = 0.0, 12.0, np.minimum(rows[40], 0.3)
-    assert _odd(rows) == [3, 17, 40]
+    found = _odd(rows)
+    assert sorted(found) == [3, 17, 40]
+    assert "blank" in found[3] and "dark" in found[17] and "blank or saturated" in found[40]
+
+
+def test_a_view_that_was_accepted_before_stays_where_it_was():
+    rejections = Rejections(5)
+    before = clra.Motion(shift_u=[0, 4, -5, 3, 0], shift_v=[0] * 5)
+    after = clra.Motion(shift_u=[1, 4, 9, 3, 9], shift_v=[0] * 5)
+    rejected = np.arange(5) == 2
+    # Rejected from the first on it lies between its neighbours, ...
+    settled = rejections.settled(before, after, rejected, first=True)
+    assert settled.shift_u.tolist() == [1, 4, 3.5, 3, 9]
+    rejections.settled(before, before, rejected & False, first=False)
+    # ... accepted in between it keeps what that gave.
+    settled = rejections.settled(before, after, rejected, first=False)
+    assert settled.shift_u.tolist() == [1, 4, -5, 3, 9]
+
+
+def test_each_rejected_view_has_its_reason():
+    rejections = Rejections(6, [4])
+    rejections.reasons = {1: "blank"}
+    found = rejections.of(np.array([0.99, 0.99, 0.1, 0.99, 0.99, 0.99]))
+    assert np.flatnonzero(found).tolist() == [2, 4]
+    texts = [str(finding) for finding in rejections.findings(np.arange(6) % 4 != 0)]
+    assert texts[0] == "view 1 rejected: blank"
+    assert texts[1].startswith("views 2, 3, 5 rejected: no fit")
+    (excluded,) = rejections.findings(np.arange(6) == 4)
+    assert excluded.measured == {"views": "4", "reason": "excluded by the user"}
 
 
 def test_ends_of_a_scan_that_look_past_the_sample_are_not_odd():
     fading = np.clip(np.minimum(np.arange(80), np.arange(80)[::-1]) / 8, 0.05, 1.0)
     rows = np.random.default_rng(2).normal(1.0, 0.3, (80, 17, 19)) * fading[:, None, None]
-    assert _odd(rows.astype(np.float32)) == []
+    assert _odd(rows.astype(np.float32)) == {}
 
 
 def _around(views):

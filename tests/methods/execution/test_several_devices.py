@@ -43,6 +43,7 @@ for method in ("fbp", "katsevich"):
     alone = clra.reconstruct(scan, method)
     assert np.linalg.norm(shared - alone) < 1e-5 * np.linalg.norm(alone), method
     assert (shared != 0).any(axis=(1, 2)).sum() > 10
+    progress = [p for p in progress if p.stage == progress[-1].stage]
     assert [p.done for p in progress] == sorted(p.done for p in progress)
     assert progress[-1].done == progress[-1].total
 assert worked == {device.int_ptr for device in devices}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clra.app.simulation import counted, paper_like, sample, simulated_motion
+from clra.model.corrections import detector_statistics
 from clra.model.corrections.detector_statistics import DetectorStatistics
 
 SHAPE = (72, 80)
@@ -125,3 +126,9 @@ def test_single_events_do_not_count():
 def test_too_few_views_tell_nothing():
     images, _ = spoilt(radiographs(views=4), 0)
     assert not found(images).bad.any()
+
+
+def test_bands_of_a_large_detector_give_what_the_whole_does(monkeypatch):
+    images, bad = spoilt(noisy(radiographs("helix", views=60), 2000), 4, rows=1)
+    monkeypatch.setattr(detector_statistics, "_BAND", 1200)
+    np.testing.assert_array_equal(found(images).bad, bad)

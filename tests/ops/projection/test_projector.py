@@ -50,7 +50,7 @@ def turned(geometry: ConeBeamGeometry, roll: float, pitch: float) -> ConeBeamGeo
     )
 
 
-def joseph(geometry: ConeBeamGeometry, grid: VolumeGrid) -> np.ndarray:
+def joseph(geometry: ConeBeamGeometry, grid: VolumeGrid, *, over_depth: bool = False) -> np.ndarray:
     """Matrix of the forward projection, (pixels, voxels), in float64."""
     column = np.arange(geometry.columns) - (geometry.columns - 1) / 2
     row = np.arange(geometry.rows) - (geometry.rows - 1) / 2
@@ -71,6 +71,8 @@ def joseph(geometry: ConeBeamGeometry, grid: VolumeGrid) -> np.ndarray:
             voxel[:, q] += a
             voxel[:, w] += b
             weight = (1 - np.abs(at - voxel))[:, [q, w]].prod(axis=1)
+            if over_depth:
+                weight *= direction[rays, p] / ((plane - start[rays, p]) * grid.voxel_size)
             on = ((voxel >= 0) & (voxel < sizes)).all(axis=1)
             matrix[rays[on], *voxel[on, ::-1].T] += weight[on]
         matrix[rays] *= np.linalg.norm(step, axis=1)[:, None, None, None] * grid.voxel_size

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from clra.findings import Finding
-from clra.methods.alignment.held_out import HeldOut, Predicted
+from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.assessment.held_out import HeldOut, Predicted
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
@@ -27,14 +28,23 @@ VERDICTS = ("good", "doubtful", "failed")
 # Errors are so many times what held-out views see of them: the rest is in slow modes, which all
 # parts of the views share; on arcs of less than a turn there are more of them. Over the kinds of
 # `tools/stress.py` errors are 0.8 to 2 times, and 2 to 5 times, what is seen.
-_UNSEEN, _UNSEEN_ON_ARCS = 1.4, 2.5
+_UNSEEN, _UNSEEN_ON_ARCS, _UNSEEN_OF_CUT_OFF = 1.2, 2.2, 4.0
+# Views below which what is seen is mostly that they hardly predict each other.
+_MANY = 100
+# Mean absolute error over root mean square, of normal errors.
+_MEAN = 0.8
+# Quantile of the views' residuals above which a view counts as misplaced, and the part of what
+# would explain its excess that its error along either axis is taken to be.
+_USUAL, _MISPLACED = 0.75, 0.35
 # Error from which on a result is doubtful, and failed [pixel].
 _DOUBTFUL, _FAILED = 0.3, 2.0
 # Part of a held-out radiograph that is not predicted, likewise. With the true motion it is 0.02 to
 # 0.1 in good scans, and 0.13 and 0.2 in samples 1.5 and 2 times as wide as the field of view.
-_UNEXPLAINED, _HOPELESS = 0.16, 0.5
+_UNEXPLAINED, _HOPELESS = 0.2, 0.5
 # Views below which many of them are not predicted for lack of others.
 _FEW = 40
+# Points of the sample by which the gauge is known.
+_POINTS = 300
 # Views at each side over which squares of what is found left are averaged.
 _AROUND = 4
 
@@ -128,7 +138,8 @@ def assess(
         With its quality, and with standard errors that count what held-out views find to be left;
         with the start as its motion if the one that was found predicts them no better.
     """
-    held_out = HeldOut(stream, scan)
+    region = region_of(stream, scan, default_grid(scan.geometry))
+    held_out = HeldOut(stream, scan, region.grid)
     radiographs, views = held_out.radiographs(aligned.valid_views)
 
     def predicted(motion: Motion, whole: bool, name: str) -> Predicted:
@@ -144,10 +155,13 @@ def assess(
     if kept_start and _moved(aligned.motion, start):
         aligned = replace(aligned, motion=start)
         after = predicted(start, True, "start")
-    seen = np.isfinite(after.residual)
     left = gauge.of(after)
-    sigma = _standard_errors(aligned, left, seen, _unseen(scan))
-    error = float(_unseen(scan) * np.abs(left[seen, :2]).mean(axis=0).max())
+    unseen = _unseen(scan, region.truncated) * min(1.0, np.sqrt(len(views) / _MANY))
+    sigma = _standard_errors(aligned, left, after, unseen)
+    # Phase correlation knows no standard errors.
+    known = np.isfinite(sigma[:, :2]).all(axis=1)
+    spread = sigma[known, :2].mean(axis=0) if known.any() else np.array(_rms(left)[:2])
+    error = float(_MEAN * spread.max())
     quality = Quality(
         verdict="good",
         level=held_out.level,
@@ -220,7 +234,7 @@ class _Left:
 
     def __init__(self, scan: Scan, scale: bool) -> None:
         self._geometry, self._scale = scan.geometry, scale
-        self._points = sample_points(default_grid(scan.geometry))
+        self._points = sample_points(default_grid(scan.geometry), _POINTS)
 
     def of(self, predicted: Predicted) -> Floats:
         """Shifts and magnification, (views, 3); NaN for views that were not held out."""
@@ -245,23 +259,46 @@ def _moved(motion: Motion, start: Motion) -> bool:
     return motion != start
 
 
-def _unseen(scan: Scan) -> float:
+def _unseen(scan: Scan, truncated: bool) -> float:
+    """How many times what is seen of them errors are."""
+    if truncated:
+        return _UNSEEN_OF_CUT_OFF
     whole = covered(scan.geometry) > 2 * np.pi - 1e-6
     return _UNSEEN if whole else _UNSEEN_ON_ARCS
 
 
 def _standard_errors(
-    aligned: AlignmentResult, left: Floats, seen: NDArray[np.bool_], unseen: float
+    aligned: AlignmentResult, left: Floats, after: Predicted, unseen: float
 ) -> Floats:
-    """Registration's standard errors, and what is left around each view, in squares."""
+    """Registration's standard errors, what is left around each view, and its own misfit."""
     sigma = aligned.sigma.copy()
-    known = np.flatnonzero(seen)
+    known = np.flatnonzero(np.isfinite(after.residual))
     around = uniform_filter1d(left[known] ** 2, 2 * _AROUND + 1, axis=0, mode="nearest")
-    factor = np.array([unseen, unseen, 1.0])
+    # A view that is predicted worse than most others lies so many pixels off, if that is why.
+    usual = np.quantile(after.residual[known], _USUAL)
+    excess = np.maximum(after.residual[known] ** 2 - usual**2, 0.0)
+    misfit = _MISPLACED**2 * excess / np.maximum(after.slope[known], 1e-6) ** 2
+    m = aligned.motion
+    found = np.stack([m.shift_u, m.shift_v, m.magnification], axis=1)
+    lost = ~aligned.valid_views
+    # Along the axis along which more is left.
+    share = 2 * around[:, :2] / np.maximum(around[:, :2].sum(axis=1, keepdims=True), 1e-12)
     for axis in range(3):
-        square = np.interp(np.arange(len(sigma)), known, around[:, axis])
-        sigma[:, axis] = np.hypot(sigma[:, axis], factor[axis] * np.sqrt(square))
+        square = around[:, axis]
+        if axis < 2:
+            square = unseen**2 * square + share[:, axis] * misfit
+        everywhere = np.interp(np.arange(len(sigma)), known, square)
+        sigma[:, axis] = np.hypot(sigma[:, axis], np.sqrt(everywhere))
+        # Others have their neighbours' motion, and differ from it as neighbours do.
+        sigma[lost, axis] = np.hypot(sigma[lost, axis], _apart(found[known, axis]))
     return sigma
+
+
+def _apart(values: Floats) -> float:
+    """RMS of the difference of values and the mean of their two neighbours."""
+    if len(values) < 3:
+        return 0.0
+    return float(np.sqrt(np.mean((values[1:-1] - 0.5 * (values[:-2] + values[2:])) ** 2)))
 
 
 def _rms(left: Floats) -> tuple[float, float, float]:

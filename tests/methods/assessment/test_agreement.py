@@ -5,7 +5,7 @@ import pytest
 
 import clra
 from clra.app.simulation import paper_like, sample, simulated_motion, simulated_scan
-from clra.methods.alignment.agreement import agreement
+from clra.methods.assessment.agreement import agreement
 from clra.ops.streaming.stream import Stream
 
 VIEWS, SHAPE = 120, (96, 96)

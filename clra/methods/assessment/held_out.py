@@ -11,14 +11,15 @@ from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from clra.methods.alignment.reprojection import (
+    band_of,
     registration_for,
     reproject_and_register,
-    with_margin,
 )
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
-from clra.model.grid import default_grid
+from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.subsets import ordered_subsets
@@ -27,9 +28,8 @@ from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
 
-# Updates of the volume, all subsets of all passes. At half of it the residual of a perfect motion
-# is a fifth larger, at twice a tenth smaller.
-_UPDATES = 12
+# Updates of the volume, all subsets of all passes.
+_UPDATES = 9
 # Parts of the views, each predicted from the others: of few views a half is too few to go by.
 _FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
 # Photons that weigh the rays against each other: nearly alike.
@@ -50,12 +50,15 @@ class Predicted:
     shift : ndarray, (views, 3)
         What registration with the prediction finds to be left: shift_u, shift_v [pixel of the
         full-resolution detector] and log(magnification); 0 where it is not registered.
+    slope : ndarray, (views,)
+        Residual that a shift of one pixel of the full-resolution detector would cause.
     sharpness : float
         Mean squared gradient of the volumes.
     """
 
     residual: Floats
     shift: Floats
+    slope: Floats
     sharpness: float
 
 
@@ -69,10 +72,13 @@ class HeldOut:
         Device and memory budget.
     scan : Scan
         At full resolution.
+    grid : VolumeGrid
+        At full resolution: of all that the radiographs show.
     """
 
     stream: Stream
     scan: Scan
+    grid: VolumeGrid
 
     @property
     def level(self) -> int:
@@ -124,14 +130,14 @@ class HeldOut:
             What progress reports begin with.
         """
         level, scan = self.level, self.scan.subset(views)
-        full = with_margin(default_grid(scan.geometry))
-        grid = full.binned(level) if level > 1 else full
+        grid = self.grid.binned(level) if level > 1 else self.grid
         geometry = scan.geometry.with_motion(motion.subset(views)).binned(level)
         binned = Scan(radiographs, geometry)
         index = np.arange(len(views))
         parts = _PARTS_OF_FEW if len(views) < _FEW else _PARTS
         residual = np.full(self.scan.views, np.nan)
         shift = np.full((self.scan.views, 3), np.nan)
+        slope = np.full(self.scan.views, np.nan)
         sharpness = []
         for part in range(parts if whole else 1):
             held, train = index[part::parts], np.delete(index, np.s_[part::parts])
@@ -164,12 +170,23 @@ class HeldOut:
                 for where_it_lies in (True, False)
             )
             residual[views[held]] = np.sqrt(1 - np.clip(still.correlation, 0, 1) ** 2)
+            for view, image in zip(views[held], hidden.read(slice(0, len(held))), strict=True):
+                slope[view] = _slope(image) / level
             found = moved.motion
             shift[views[held]] = np.stack(
                 [level * found.shift_u, level * found.shift_v, np.log(found.magnification)], axis=1
             )
             sharpness.append(_gradient(volume.to_host()))
-        return Predicted(residual, shift, float(np.mean(sharpness)))
+        return Predicted(residual, shift, slope, float(np.mean(sharpness)))
+
+
+def _slope(image: NDArray[np.float32]) -> float:
+    """RMS slope of a radiograph along rows and columns, relative to its own, in the band used."""
+    low, high = band_of((image.shape[0], image.shape[1]))
+    band = gaussian_filter(image.astype(np.float64), low) - gaussian_filter(image, high)
+    slopes = np.gradient(band)
+    power = float(np.mean(band**2))
+    return float(np.sqrt(0.5 * np.mean(slopes[0] ** 2 + slopes[1] ** 2) / power)) if power else 0.0
 
 
 def _gradient(volume: NDArray[np.float32]) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clra.methods.alignment.slow_modes import SlowSteps, held, slow_part
+from clra.methods.alignment.steps.slow_modes import SlowSteps, held, slow_part
 
 VIEWS = 240
 TIME = (np.arange(VIEWS) + 0.5) / VIEWS

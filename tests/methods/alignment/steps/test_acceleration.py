@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clra.methods.alignment.acceleration import Anderson
+from clra.methods.alignment.steps.acceleration import Anderson
 
 
 def _iterate(memory, steps, gains, start):

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from clra.errors import InputError
 from clra.findings import Finding
@@ -79,7 +80,8 @@ def radiograph_findings(scan: Scan) -> list[Finding]:
     views = views[~odd]
     if not images:
         return []
-    bright = np.array([np.quantile(image, 0.02) for image in images])
+    # Means over some pixels: the brightest single ones are noise.
+    bright = np.array([np.quantile(uniform_filter(image, 9), 0.05) for image in images])
     most = max(float(np.quantile(image, 0.999)) for image in images)
     found = [_fading(bright, views), *_clipped(images[:: max(1, len(images) // _CLOSELY)])]
     columns = np.array([_border(image[:, [0, -1]]) for image in images]) - bright[:, None]
@@ -131,7 +133,8 @@ def _clipped(images: list[NDArray[np.float32]]) -> list[Finding | None]:
                 measured={"part": float(dark), "value": highest},
             )
         )
-    if bright > _SATURATED and _noisy(stack[stack.shape[0] // 2], lowest + reach):
+    # Air is exactly 0 in simulations only.
+    if lowest != 0 and bright > _SATURATED and _noisy(stack[stack.shape[0] // 2], lowest + reach):
         found.append(
             Finding(
                 "clipped-detector",
@@ -157,7 +160,8 @@ def _noisy(image: NDArray[np.float32], lowest: float) -> bool:
     for _ in range(4):
         values, clear = np.diff(values, axis=1), clear[:, 1:] & clear[:, :-1]
     both = clear[:, 1:] & clear[:, :-1]
-    if both.sum() < 100:
+    # Rounding alternates, too.
+    if both.sum() < 100 or np.median(np.abs(values[clear])) < 2e-3 * float(image.max()):
         return False
     # The edges of the sample are few: signs, so that large products do not count more.
     signs = np.sign(values[:, 1:][both]) * np.sign(values[:, :-1][both])
@@ -178,8 +182,8 @@ def _truncation(columns: Floats, most: float, geometry: ConeBeamGeometry) -> Fin
                 "half-fan",
                 f"the axis is seen {abs(aside):.0f} columns beside the detector's middle, and the "
                 "sample is cut off at that side: a scan of half the fan",
-                "only the circle that all views see is reconstructed; scans of half the fan are "
-                "not supported",
+                "the sample is taken to reach as far at the other side; check the axis column "
+                "(--centre-offset) if it does not",
                 measured={"aside": aside},
             )
     if not cut > _AT_BORDER * most:

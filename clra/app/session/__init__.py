@@ -1,0 +1,1 @@
+"""What surrounds a command: its configuration file and its log."""

@@ -1,0 +1,1 @@
+"""Alignment in up to six degrees of freedom a view."""

@@ -1,0 +1,153 @@
+"""One resolution of a rigid alignment: reconstruct, project, and solve for six numbers a view."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.alignment.options import Solver
+from clra.methods.alignment.reprojection import binned_mask
+from clra.methods.alignment.rigid.rigid_solution import RigidStep, solve
+from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
+from clra.model.rigid.rigid_motion import RigidMotion
+from clra.model.scan import Scan
+from clra.ops.registration.rigid_registration import (
+    IMAGES,
+    PRODUCTS,
+    RigidRegistration,
+    rigid_table,
+)
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import SlabMoments
+from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
+
+Floats = NDArray[np.float64]
+
+# Sigmas of the band-pass [pixel of the level]: the narrowest that splines allow, for rotations
+# move fine structure far from the axis.
+_BAND = (0.7, 8.0)
+
+
+@dataclass
+class RigidLevel:
+    """The radiographs of one resolution, and what their re-projections are displaced by.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        At full resolution.
+    grid : VolumeGrid
+        At full resolution.
+    solver : Solver
+        Parts of the iteration.
+    factor : int
+        Binning.
+    free : tuple of int
+        Parameters to estimate, of `clra.model.rigid.rigid_motion.PARAMETERS`.
+    prior : ndarray, (6,)
+        Expected standard deviation of each parameter [mm, rad]; 0 for unknown.
+    """
+
+    stream: Stream
+    scan: Scan
+    grid: VolumeGrid
+    solver: Solver
+    factor: int
+    free: tuple[int, ...]
+    prior: Floats
+    radiographs: Radiographs = field(init=False)
+    bias: Floats | None = field(init=False, default=None)  # what is found where nothing moved
+
+    def __post_init__(self) -> None:
+        self.radiographs = Radiographs(self.stream, self.scan, self.factor)
+        if self.factor > 1:
+            self.grid = self.grid.binned(self.factor)
+
+    def step(
+        self, motion: RigidMotion, *, valid_views: NDArray[np.bool_], measure: bool, title: str
+    ) -> RigidStep:
+        """Return what is left of the motion.
+
+        Parameters
+        ----------
+        motion : RigidMotion
+            As known so far.
+        valid_views : ndarray of bool, (views,)
+            Views to reconstruct from.
+        measure : bool
+            Whether to find the bias, if it is not known.
+        title : str
+            What progress reports begin with.
+        """
+        geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
+        volume = self._volume(self.radiographs, geometry, valid_views, title)
+        found = self._registered(self.radiographs, volume, geometry, title)
+        if measure and self.bias is None and self.solver.unbias:
+            doing = f"{title}, of what is simulated"
+            still = reprojections(self.stream, volume, geometry, self.factor, doing)
+            del volume
+            again = self._volume(still, geometry, valid_views, doing)
+            self.bias = self._registered(still, again, geometry, doing).table
+        return found if self.bias is None else found.less(self.bias)
+
+    def _volume(
+        self,
+        radiographs: Radiographs,
+        geometry: ConeBeamGeometry,
+        valid_views: NDArray[np.bool_],
+        title: str,
+    ) -> Volume:
+        mask = self.scan.mask
+        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
+        return fitted_fbp(
+            self.stream,
+            radiographs,
+            geometry,
+            self.grid,
+            positive=self.solver.positive,
+            terms=self.solver.terms,
+            valid_views=valid_views,
+            circle=self.solver.circle,
+            used=binned_mask(full, self.factor),
+            stage=f"{title}: reconstructing",
+        )
+
+    def _registered(
+        self, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, title: str
+    ) -> RigidStep:
+        """Sum up the normal equations of each view, and solve them."""
+        stream, mask = self.stream, self.scan.mask
+        views, rows, columns = radiographs.shape
+        # The registration keeps eight images of a view twice.
+        chunks = stream.chunks(views, 2 * IMAGES * radiographs.view_bytes)
+        register = RigidRegistration(
+            stream.context,
+            (rows, columns),
+            views=max(chunk.stop - chunk.start for chunk in chunks),
+            low_pass=_BAND[0],
+            high_pass=_BAND[1],
+            mask=None if mask is None else binned_mask(mask, self.factor),
+            allocator=stream.memory,
+        )
+        project = SlabMoments(stream, volume, geometry)
+        table = rigid_table(geometry)
+        totals = np.empty((views, PRODUCTS))
+        for chunk in chunks:
+            stream.report(f"{title}: registering", chunk.start, views)
+            count = chunk.stop - chunk.start
+            measured = stream.upload(radiographs.read(chunk))
+            simulated, over_depth = (stream.empty((count, rows, columns)) for _ in range(2))
+            project.moments(simulated, over_depth, chunk)
+            out = stream.empty((count, PRODUCTS))
+            numbers = stream.upload(table[chunk])
+            register(stream.queue, out, measured, simulated, over_depth, numbers)
+            totals[chunk] = stream.download(out)
+            del measured, simulated, over_depth, numbers, out
+        stream.report(f"{title}: registering", views, views)
+        correlated = 4 * np.pi * register.low_pass**2  # pixels that count as one sample
+        return solve(totals, self.free, self.prior, register.total_weight, max(1.0, correlated))

@@ -1,0 +1,92 @@
+"""Normal equations of rigid motion, solved view by view."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.ops.registration.rigid_registration import IMAGES
+
+Floats = NDArray[np.float64]
+
+_GAIN, _DIFFERENCE = 6, 7  # the simulated radiograph, and measured less simulated
+_RIDGE = 1e-12  # of the diagonal: parameters that a view does not show stay 0
+
+
+@dataclass(frozen=True)
+class RigidStep:
+    """What the views ask for, and how well they tell it.
+
+    Attributes
+    ----------
+    table : ndarray, (views, 6)
+        Translations [mm] and rotations [rad], as in `clra.model.rigid.rigid_motion.PARAMETERS`.
+    sigma : ndarray, (views, 6)
+        Standard errors of the noise, the prior included; NaN where not estimated.
+    correlation : ndarray, (views,)
+        Of the measured and the simulated radiograph, before the step.
+    residual : ndarray, (views,)
+        Root mean square of what is left after it [attenuation].
+    """
+
+    table: Floats
+    sigma: Floats
+    correlation: Floats
+    residual: Floats
+
+    def less(self, bias: Floats) -> "RigidStep":
+        """Return the step without what is found where nothing moved."""
+        return replace(self, table=self.table - bias)
+
+
+def solve(
+    totals: Floats, free: tuple[int, ...], prior: Floats, weight: float, correlated: float
+) -> RigidStep:
+    """Solve the normal equations.
+
+    Parameters
+    ----------
+    totals : ndarray, (views, 36)
+        As `clra.ops.registration.rigid_registration.RigidRegistration` gives them.
+    free : tuple of int
+        Parameters to estimate; a gain is always fitted.
+    prior : ndarray, (6,)
+        Expected standard deviation of each step; 0 for unknown.
+    weight : float
+        Sum of the weights of the pixels.
+    correlated : float
+        Pixels whose noise counts as one sample.
+    """
+    views, count = len(totals), len(free)
+    gram = np.empty((views, IMAGES, IMAGES))
+    upper = np.triu_indices(IMAGES)
+    gram[:, upper[0], upper[1]] = gram[:, upper[1], upper[0]] = totals
+    unknown = [*free, _GAIN]
+    # Of one length each, or millimetres and radians differ by orders of magnitude.
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", gram)[:, unknown], 1e-300))
+    normal = gram[:, unknown][:, :, unknown] / scale[:, :, None] / scale[:, None, :]
+    right = gram[:, unknown, _DIFFERENCE] / scale
+    square = gram[:, _DIFFERENCE, _DIFFERENCE]
+    ridge = _RIDGE * np.eye(count + 1)
+
+    def variance(x: Floats) -> Floats:
+        left = square - 2 * np.sum(x * right, axis=1) + np.einsum("ni,nij,nj->n", x, normal, x)
+        return np.asarray(np.maximum(left, 1e-12 * square) / weight)
+
+    plain = np.linalg.solve(normal + ridge, right[:, :, None])[:, :, 0]
+    noise = correlated * variance(plain)
+    known = np.zeros((views, count + 1))
+    some = prior[list(free)] > 0
+    known[:, :count][:, some] = noise[:, None] / prior[list(free)][some] ** 2
+    held = normal + ridge + np.einsum("ni,ij->nij", known / scale**2, np.eye(count + 1))
+    inverse = np.linalg.inv(held)
+    x = np.einsum("nij,nj->ni", inverse, right)
+    table, sigma = np.zeros((views, 6)), np.full((views, 6), np.nan)
+    table[:, list(free)] = (x / scale)[:, :count]
+    spread = np.sqrt(noise[:, None] * np.einsum("nii->ni", inverse)) / scale
+    sigma[:, list(free)] = spread[:, :count]
+    own = gram[:, _GAIN, _GAIN]
+    crossed = own + gram[:, _GAIN, _DIFFERENCE]
+    measured = own + 2 * gram[:, _GAIN, _DIFFERENCE] + square
+    correlation = crossed / np.sqrt(np.maximum(own * measured, 1e-300))
+    return RigidStep(table, sigma, correlation, np.sqrt(variance(x)))

@@ -1,0 +1,1 @@
+"""How an iteration goes on from a registration: extrapolation, and modes that are slow."""

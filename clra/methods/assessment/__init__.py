@@ -1,0 +1,1 @@
+"""Evidence for and against an alignment: held-out views, half scans, sharpness, radiographs."""

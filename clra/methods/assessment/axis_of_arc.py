@@ -1,0 +1,132 @@
+"""The column of the rotation axis of an arc, by the rays that its views measure twice.
+
+Slices of an arc are sharpest with the detector tilted by some degrees too much. What two views see
+along the same line has to agree instead: radiographs of half a turn apart, mirrored, and of a fan
+each ray with the one that comes back along it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.errors import InputError
+from clra.model.detector_pose import with_detector
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.sampling.angular_coverage import holes
+from clra.model.scan import Scan
+from clra.ops.streaming.stream import Stream
+
+Floats = NDArray[np.float64]
+
+# Rows about the source's height that are averaged: one is noisy, and far from that height the two
+# rays of a line in a cone beam are not the same.
+_ROWS = 5
+# Offsets up to this part of the detector's width are searched, first in steps of this many pixels,
+# then ever closer.
+_REACH, _STEP, _LEAST_STEP = 0.125, 2.0, 0.02
+# Part of the pixels that have to be measured twice; and how much the best agreement has to be
+# better than the median of those searched.
+_FEWEST, _CONTRAST = 0.002, 1.5
+
+
+def axis_offset(stream: Stream, scan: Scan) -> tuple[float, float]:
+    """Find the column of the axis by what is measured twice.
+
+    Parameters
+    ----------
+    stream : Stream
+        Memory budget, and whom to tell how far it is.
+    scan : Scan
+        Of half a turn at least, and of a fan rather half a turn and the fan.
+
+    Returns
+    -------
+    offset_u : float
+        Column of the axis' projection from where the scan's geometry puts it [pixel].
+    gain : float
+        Squared differences of the rays of a line at an offset of 0, relative to those found.
+
+    Raises
+    ------
+    InputError
+        If hardly any ray is measured twice, or no offset makes them agree.
+    """
+    lines = _sinogram(stream, scan)
+    reach, step, centre = _REACH * scan.geometry.columns, _STEP, 0.0
+    searched = np.arange(-reach, reach + 0.5 * step, step)
+    costs = np.array([_disagreement(lines, scan.geometry, offset) for offset in searched])
+    if not np.isfinite(costs).any():
+        raise InputError(
+            f"{scan.name}: found hardly a ray that is measured twice, expected views over half a "
+            "turn and the fan to find the axis by"
+        )
+    centre = float(searched[np.nanargmin(costs)])
+    if np.nanmedian(costs) < _CONTRAST * np.nanmin(costs) or abs(centre) > reach - step:
+        raise InputError(
+            f"{scan.name}: found no offset of the axis, up to {reach:.3g} pixels, at which rays "
+            "along the same line agree"
+        )
+    while step > _LEAST_STEP:
+        step /= 4
+        near = centre + step * np.arange(-5, 6)
+        costs = np.array([_disagreement(lines, scan.geometry, offset) for offset in near])
+        centre = float(near[np.nanargmin(costs)])
+    before = _disagreement(lines, scan.geometry, 0.0)
+    return centre, float(before / max(float(np.nanmin(costs)), np.finfo(float).tiny))
+
+
+def _sinogram(stream: Stream, scan: Scan) -> Floats:
+    """Line integrals at the height of each source, (views, columns)."""
+    lines = np.empty((scan.views, scan.geometry.columns))
+    middle = np.clip(np.rint(scan.geometry.principal[:, 1]), 0, scan.geometry.rows - 1).astype(int)
+    for view in range(scan.views):
+        stream.report("auto-focus: reading", view, scan.views)
+        low = max(0, middle[view] - _ROWS // 2)
+        rows = scan.read(view, view + 1)[0, low : low + _ROWS]
+        lines[view] = rows.mean(axis=0, dtype=np.float64)
+    return lines
+
+
+def _disagreement(lines: Floats, ideal: ConeBeamGeometry, offset: float) -> float:
+    """Squared difference of the rays of a line, relative to their squares; NaN of too few."""
+    geometry = with_detector(ideal, offset_u=offset)
+    angle, fan = _rays(geometry)
+    order = np.argsort(angle)
+    other = (angle[:, None] + np.pi + 2 * fan) % (2 * np.pi)
+    inside = np.ones(other.shape, np.bool_)
+    step = float(np.median(np.diff(angle[order])))
+    for start, width in holes(geometry):
+        # The view before stands for one that is a step further: of half a turn, that is the pair.
+        beyond = (other - start) % (2 * np.pi)
+        inside &= (beyond <= step) | (beyond >= width - step)
+    at = np.interp(other, angle[order], np.arange(len(order)), period=2 * np.pi)
+    lower = np.floor(at).astype(int) % len(order)
+    upper, part = (lower + 1) % len(order), at - np.floor(at)
+    seen = np.zeros(other.shape)
+    for neighbour, weight in ((lower, 1 - part), (upper, part)):
+        view = order[neighbour]
+        column = _column_of(fan, view, -fan)
+        inside &= (column >= 0) & (column <= lines.shape[1] - 1)
+        left = np.clip(np.floor(column).astype(int), 0, lines.shape[1] - 2)
+        f = column - left
+        seen += weight * ((1 - f) * lines[view, left] + f * lines[view, left + 1])
+    if inside.mean() < _FEWEST:
+        return float("nan")
+    squares = np.sum(lines[inside] ** 2 + seen[inside] ** 2)
+    return float(np.sum((lines[inside] - seen[inside]) ** 2) / max(squares, 1e-30))
+
+
+def _rays(geometry: ConeBeamGeometry) -> tuple[Floats, Floats]:
+    """Angle of each source, and of its columns' rays from the way to the axis [rad]."""
+    place = np.arange(geometry.columns) - (geometry.columns - 1) / 2
+    row = geometry.principal[:, 1] - (geometry.rows - 1) / 2
+    middle = geometry.detector + row[:, None] * geometry.v - geometry.source
+    ray = middle[:, None, :2] + place[:, None] * geometry.u[:, None, :2]
+    x, y = geometry.source[:, 0, None], geometry.source[:, 1, None]
+    fan = np.arctan2(-x * ray[..., 1] + y * ray[..., 0], -x * ray[..., 0] - y * ray[..., 1])
+    return np.arctan2(x[:, 0], -y[:, 0]) % (2 * np.pi), fan
+
+
+def _column_of(fan: Floats, view: NDArray[np.intp], wanted: Floats) -> Floats:
+    """Column of other views at which their fan has an angle, by the views' tangents."""
+    first, last = np.tan(fan[view, 0]), np.tan(fan[view, -1])
+    return np.asarray((np.tan(wanted) - first) / (last - first) * (fan.shape[1] - 1))

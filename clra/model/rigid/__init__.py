@@ -1,0 +1,1 @@
+"""Rigid motion of the sample in each view, and its gauge."""
