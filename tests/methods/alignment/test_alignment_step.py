@@ -48,6 +48,16 @@ def test_the_volume_is_the_sample(context, queue):
     assert np.abs(estimates[:, :2]).mean() < STILL
 
 
+def test_the_volume_is_not_negative_unless_asked_for(context, queue):
+    still = ROCK.line_integrals(GEOMETRY)
+    volumes = [
+        once(clra.AlignmentStep(context, GEOMETRY, GRID, positive=positive), queue, still)[1]
+        for positive in (True, False)
+    ]
+    assert volumes[0].min() == 0 > volumes[1].min()
+    assert np.abs(volumes[0] - np.maximum(volumes[1], 0)).max() < ROUNDING * volumes[1].max()
+
+
 def test_repeated_it_finds_the_motion(context, queue, truth):
     measured = ROCK.line_integrals(GEOMETRY.with_motion(truth))
     step = clra.AlignmentStep(context, GEOMETRY, GRID, magnification=False)

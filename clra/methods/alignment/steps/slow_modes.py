@@ -82,6 +82,6 @@ class SlowSteps:
         size = max(float(np.sqrt(np.mean(slow_part(row, even) ** 2))) for row in step)
         last, self._last = self._last, size
         if last is None:
-            return float("inf")
+            return size  # as if half of it were left each time
         contraction = min(size / last, _SLOWEST) if last > 0 else 0.0
         return size * contraction / (1 - contraction)
