@@ -14,6 +14,18 @@ from clra.ops.runtime.profile import DeviceProfile, forced
 TESTS = Path(__file__).parent
 # Folders whose tests run kernels.
 _ON_A_DEVICE = ("app", "kernels", "methods", "ops", "tools")
+# Folders whose tests align and reconstruct whole scans, or build for every kind of device.
+_SLOW = ("app", "kernels", "methods", "tools")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests by their folder, so that -m chooses what a change calls for."""
+    for item in items:
+        folder = item.path.relative_to(TESTS).parts[0]
+        if folder in _ON_A_DEVICE:
+            item.add_marker("device")
+        if folder in _SLOW:
+            item.add_marker("slow")
 
 
 def pytest_report_header() -> str:

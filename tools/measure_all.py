@@ -32,6 +32,7 @@ COMMANDS = {
     "baselines": "baselines.py",
     "source": "source_drift.py",
     "katsevich": "exact_helices.py",
+    "rigid": "rigid.py -o FOLDER",
     "wood": "figure4_small.py --scale 16 -o FOLDER",
     "imgr": "imgr_small.py",
     "memory": "memory_peaks.py",
