@@ -16,7 +16,7 @@ from clra.model.grid import default_grid
 SHIFT = 6.0  # pixel, either way
 # Mean absolute errors allowed [pixel], without what the data cannot see in a parallel beam: a
 # constant in v; a constant, a cosine and a sine of the angle in u.
-TOLERANCE_U, TOLERANCE_V = 0.35, 0.10
+TOLERANCE_U, TOLERANCE_V = 0.05, 0.10
 
 
 @pytest.fixture(scope="module")
