@@ -137,7 +137,7 @@ def evidence(
     # Judged without its motion, a scan that moved far may seem to fit anything better; the other
     # axis counts in any case, as an alignment makes up for a wrong one.
     if other is not None and other.code != "axis-offset":
-        other = other if other.measured["otherwise"] < quality.residual_after else None
+        other = other if float(other.measured["otherwise"]) < quality.residual_after else None
     if other is None and _fan(scan.geometry) < _NARROW:
         sharper = sharpening_by_opposite_rotation(stream, scan, aligned.motion)
         other = doubted_rotation(sharper) if sharper == sharper else None
