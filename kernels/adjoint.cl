@@ -48,8 +48,8 @@ always_inlined void add_columns(
     const int q = 1 - p, columns = s.columns, rows = s.rows;
     const float at_p = p ? y : x, at_q = p ? x : y;
     const float a = fma(m[0], x, fma(m[1], y, m[3])), g = fma(m[8], x, fma(m[9], y, m[11]));
-    const float one = (a - m[q]) * native_recip(g - m[8 + q]);
-    const float two = (a + m[q]) * native_recip(g + m[8 + q]);
+    const float one = (a - m[q]) * reciprocal(g - m[8 + q]);
+    const float two = (a + m[q]) * reciprocal(g + m[8 + q]);
     const int left = max((int)ceil(SMALLER(one, two) - SLACK), 0);
     const int right = min((int)floor(LARGER(one, two) + SLACK), columns - 1);
 #pragma unroll 1

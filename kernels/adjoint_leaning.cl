@@ -25,7 +25,7 @@ always_inlined void add_leaning(
     const float last = VOXELS - 1;
     const float a = AT(m, x, y, z), g = AT(m + 8, x, y, z);
     const float a9 = fma(last, m[2], a), g9 = fma(last, m[10], g);
-    const float one = a * native_recip(g), two = a9 * native_recip(g9);
+    const float one = a * reciprocal(g), two = a9 * reciprocal(g9);
     const float reach_one = support(m, 0, q, 2, g, one), reach_two = support(m, 0, q, 2, g9, two);
     const float low = SMALLER(one - reach_one, two - reach_two);
     const float high = LARGER(one + reach_one, two + reach_two);
@@ -41,20 +41,20 @@ always_inlined void add_leaning(
         const float dz = fma((float)c, m[20], m[17]);
         // The row that passes voxel k's height in its plane: (start + k dp) / (turn - k m[21 + p]).
         const float start = -fma(away_z, dp, away_p * dz);
-        const float row0 = start * native_recip(turn);
-        const float row9 = fma(last, dp, start) * native_recip(fma(-last, m[21 + p], turn));
+        const float row0 = start * reciprocal(turn);
+        const float row9 = fma(last, dp, start) * reciprocal(fma(-last, m[21 + p], turn));
         const float top = SMALLER(row0, row9), bottom = LARGER(row0, row9);
         // the rows' distance at the voxels' plane; along the block it changes by parts of a percent
-        const float inverse = native_recip(fma(row0, m[21 + p], dp));
+        const float inverse = reciprocal(fma(row0, m[21 + p], dp));
         const float size =
             fabs(away_p * (m[23] * dp - m[21 + p] * dz)) * inverse * inverse * 0.99f;
-        const float reach = native_recip(size);
+        const float reach = reciprocal(size);
         if (bottom + reach <= 0.0f || top - reach >= rows - 1.0f)
             continue;
         // Share of the ray along (p, q, z) in a voxel that is away_z below the source.
 #define SHARE(p, q, z, away_z)                                                                     \
-    (SATURATE(1.0f - fabs(fma(away_p * native_recip(p), q, away_q))) *                             \
-     SATURATE(1.0f - fabs(fma(away_p * native_recip(p), z, away_z))))
+    (SATURATE(1.0f - fabs(fma(away_p * reciprocal(p), q, away_q))) *                               \
+     SATURATE(1.0f - fabs(fma(away_p * reciprocal(p), z, away_z))))
         // Three rows around hold all that share where they are more than 2/3 of a voxel apart.
         if (INSIDE || (!mixed && top >= 2.0f && bottom < rows - 3.0f && size >= 2.0f / 3.0f)) {
             const uint base = UNIT * ((uint)c - BIAS * (uint)COLUMNS);
@@ -70,7 +70,7 @@ always_inlined void add_leaning(
     _Pragma("unroll") for (int k = 0; k < VOXELS; ++k)                                             \
     {                                                                                              \
         const float row = fma((float)k, dp, start) *                                               \
-                          native_recip(fma((float)-k, m[21 + p], turn));                           \
+                          reciprocal(fma((float)-k, m[21 + p], turn));                             \
         const float rounded = (row - BEFORE) + MAGIC, whole = rounded - MAGIC;                     \
         const uint at = WHOLE(rounded) * (UNIT * COLUMNS) + base;                                  \
         const float at_p = fma(whole, m[21 + p], dp), at_q = fma(whole, m[21 + q], dq);            \
@@ -92,7 +92,7 @@ always_inlined void add_leaning(
 #pragma unroll 1
             for (int k = 0; k < VOXELS; ++k) {
                 const float row =
-                    fma((float)k, dp, start) * native_recip(fma((float)-k, m[21 + p], turn));
+                    fma((float)k, dp, start) * reciprocal(fma((float)-k, m[21 + p], turn));
                 const int from = (int)ceil(clamp(row - reach - SLACK, 0.0f, (float)rows));
                 const int to = (int)clamp(row + reach + SLACK, -1.0f, rows - 1.0f);
                 float total = 0.0f;

@@ -2,8 +2,7 @@
 
 ``python tools/portability.py [NAME ...] [--quick]`` runs, each where it is installed:
 
-- ``intel``: all tests but those of GPU forms on Intel's CPU runtime (wheels ``intel-opencl-rt
-  intel-cmplr-lib-rt``);
+- ``intel``: all tests on Intel's CPU runtime (wheels ``intel-opencl-rt intel-cmplr-lib-rt``);
 - ``debian-pocl``: all tests on Debian's PoCL (``pocl-opencl-icd``), beside the wheel's;
 - ``rusticl``: every operator on Mesa's Rusticl with llvmpipe (Debian ``mesa-opencl-icd``);
 - ``two-devices``: every operator on either device of a context of two (PoCL);
@@ -107,9 +106,6 @@ def runs(quick: bool) -> dict[str, Run]:
             {"OCL_ICD_VENDORS": "{icds}", "CLRA_DEVICE": "Intel"},
             "Intel",
             icds=(INTEL,),
-            # Forms for GPUs do not run on CPUs but in tests; the adjoint of tilted views misses
-            # their tolerance here, by 1e-3 of the values: this native_recip is a coarse one.
-            more=("-k", "not gpu"),
         ),
         "debian-pocl": Run(
             QUICK if quick else (),
