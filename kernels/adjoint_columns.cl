@@ -11,7 +11,7 @@
 #define WIDTH 16
 #endif
 
-#define SLACK 1e-2f // as in adjoint.cl
+#define SLACK 1e-2f // as in adjoint.clh
 
 // Adds what one detector column gives to `voxels` voxels of two neighbouring columns. The voxels
 // are `slope` rows apart and the first is at `row`; a row shares in voxels within |slope| rows.

@@ -13,7 +13,7 @@
 #define WIDTH 16
 #endif
 
-#define SLACK 1e-2f // as in adjoint.cl
+#define SLACK 1e-2f // as in adjoint.clh
 
 // More rows a voxel than this, and rays are treated one by one.
 #define MANY 1.4f

@@ -173,7 +173,7 @@ kernel required_group void backproject_voxels(
             const uint base = 0u - UNIT * BIAS * (uint)(COLUMNS + 1);
 #pragma unroll
             for (int k = 0; k < VOXELS; ++k) {
-                const float scale = native_recip(fma(pg.z, (float)k, g));
+                const float scale = reciprocal(fma(pg.z, (float)k, g));
                 const float column = fma(pa.z, (float)k, a) * scale;
                 const float row = fma(pb.z, (float)k, b) * scale;
                 const float tr = (row - 0.5f) + MAGIC, tc = (column - 0.5f) + MAGIC;

@@ -7,10 +7,10 @@
 // Kernels of rays: one work-item a pixel of a radiograph (`deviance`: of the detector, for all
 // views); global size (pixels, views). Kernels of voxels: one a voxel. Ranges may be rounded up.
 
-// Line integrals are taken to lie in this range: a hot pixel may show more than the open beam, and
-// none tells less than exp(-30).
 #include "group.clh"
 
+// Line integrals are taken to lie in this range: a hot pixel may show more than the open beam, and
+// none tells less than exp(-30).
 #define LEAST -1.0f
 #define MOST 30.0f
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clra.model.corrections.corrections import Corrections
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 
 
@@ -63,6 +64,9 @@ def binned_motion(motion: Motion, factor: int, shape: tuple[int, int]) -> Motion
     """
     rows, columns = shape
     moved = motion.about(-0.5 * (columns % factor), -0.5 * (rows % factor))
+    if isinstance(moved, RigidMotion):  # in lengths: only the pixels it is seen in are others
+        optics = moved.optics / np.array([1, factor, factor, factor, factor])
+        return RigidMotion(translation=moved.translation, rotation=moved.rotation, optics=optics)
     return Motion(
         shift_u=moved.shift_u / factor,
         shift_v=moved.shift_v / factor,

@@ -40,7 +40,7 @@ class Motion:
     ------
     InputError
         If lengths disagree, a number is not finite, a magnification is not positive or `cause` is
-        none of the two.
+        none of these.
     """
 
     shift_u: Floats
@@ -89,11 +89,11 @@ class Motion:
         """Compare exactly, number by number."""
         if not isinstance(other, Motion):
             return NotImplemented
-        return self.cause == other.cause and np.array_equal(self._table(), other._table())
+        return self.cause == other.cause and np.array_equal(self.columns(), other.columns())
 
     def __repr__(self) -> str:
         """Summarise the ranges."""
-        u, v, m = ((a.min(), a.max()) for a in self._table())
+        u, v, m = ((a.min(), a.max()) for a in self.columns())
         moved = " of the source" if self.cause == "source" else ""
         return (
             f"Motion({self.views} views{moved}, shift_u {u[0]:.4g} to {u[1]:.4g} pixel, "
@@ -187,6 +187,6 @@ class Motion:
             cause=self.cause,
         )
 
-    def _table(self) -> Floats:
-        """All three, (3, views)."""
-        return np.stack([self.shift_u, self.shift_v, self.magnification])
+    def columns(self) -> tuple[Floats, ...]:
+        """Return all numbers that tell it from others but its cause, of (views,) each."""
+        return self.shift_u, self.shift_v, self.magnification

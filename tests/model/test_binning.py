@@ -5,6 +5,7 @@ import pytest
 
 import clra
 from clra.model.binning import binned_motion, binned_scan
+from clra.model.rigid.rigid_motion import RigidMotion, optics_of
 
 DETECTOR = {
     "source_to_axis": 50.0,
@@ -45,3 +46,16 @@ def test_a_motion_in_binned_pixels_is_the_same_motion(cause):
     points = np.random.default_rng(1).uniform(-1, 1, (7, 3))
     tolerance = 1e-9 if cause == "detector" else 1e-3
     assert binned.project(points) == pytest.approx(expected.project(points), abs=tolerance)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_a_rigid_motion_in_binned_pixels_keeps_its_rotations(factor):
+    geometry = clra.circular(5, **DETECTOR)
+    table = np.random.default_rng(3).normal(scale=0.1, size=(5, 6))
+    motion = RigidMotion.of(geometry, table)
+    binned = binned_motion(motion, factor, geometry.shape)
+    expected = geometry.with_motion(motion).binned(factor)
+    assert geometry.binned(factor).with_motion(binned).to_astra() == pytest.approx(
+        expected.to_astra(), abs=1e-9
+    )
+    assert binned.optics == pytest.approx(optics_of(geometry.binned(factor)), rel=1e-12)

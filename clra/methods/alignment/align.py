@@ -134,9 +134,7 @@ def align(
     """
     _check(scan, method, estimate, gauge)
     keeping, own = checkpoint_of(checkpoint, resume)
-    # What the mask leaves of the detector is aligned as a detector of its own.
-    part = scan.cropped()
-    stages = parse_schedule(schedule, part.geometry.shape) if method == "ra" else ()
+    stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
         if given is not None and given.views != scan.views:
             raise InputError(f"{name}: found {given.views} views, expected {scan.views}")
@@ -227,10 +225,9 @@ def align(
                 )
                 run.align(stages, saved)
                 aligned = run.result()
-                if estimate in FREE:
-                    aligned = RigidAlignment(
-                        stream, part, region, solver, estimate, aligned, anchor
-                    ).align()
+                if estimate in FREE and not cancelled(findings):
+                    rigid = RigidAlignment(stream, part, region, solver, estimate, aligned, anchor)
+                    aligned = _turned(rigid, aligned)
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
@@ -241,6 +238,17 @@ def align(
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()
     return result
+
+
+def _turned(rigid: RigidAlignment, shifts: AlignmentResult) -> AlignmentResult:
+    """Go on with a rigid motion; the shifts alone stay if the call is ended."""
+    try:
+        return rigid.align()
+    except Cancelled:
+        Finding("cancelled", "the alignment was ended early, with the shifts alone").warn()
+        return shifts
+    except KeyboardInterrupt:
+        raise AlignmentInterrupted(shifts) from None
 
 
 def _judged(

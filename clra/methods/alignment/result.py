@@ -25,7 +25,7 @@ class Iteration:
     Attributes
     ----------
     level : str
-        "QR", "HR" or "FR".
+        "ER", "QR", "HR" or "FR".
     iteration : int
         From 1 at each level.
     update_u_median, update_v_median, update_max : float
@@ -227,7 +227,7 @@ class AlignmentResult:
         """Return a checksum of the motion and the valid views: what a reconstruction takes."""
         motion = self.motion
         digest = hashlib.sha256(motion.cause.encode())
-        for column in (motion.shift_u, motion.shift_v, motion.magnification):
+        for column in motion.columns():
             digest.update(np.ascontiguousarray(column, "<f8").tobytes())
         digest.update(self.valid_views.tobytes())
         return f"sha256:{digest.hexdigest()}"

@@ -250,8 +250,7 @@ def identity(
         corrected = f"{scan.corrections.contents()} {known}"
     moved = None
     if motion is not None:
-        columns = (motion.shift_u, motion.shift_v, motion.magnification)
-        moved = f"{motion.cause} {fingerprint(*columns)}"
+        moved = f"{motion.cause} {fingerprint(*motion.columns())}"
     return {
         "scan": scan.checksum(),
         "geometry": fingerprint(scan.geometry.to_astra(), *masks),

@@ -10,17 +10,21 @@ from numpy.typing import NDArray
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import Iteration
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
 def motion_arrays(name: str, motion: Motion) -> dict[str, NDArray[Any]]:
-    """Return a motion as one array (3, views), its cause apart."""
-    return {name: np.stack([motion.shift_u, motion.shift_v, motion.magnification])}
+    """Return a motion as one array (numbers, views), its cause apart."""
+    return {name: np.stack(motion.columns())}
 
 
 def motion_from(arrays: Arrays, name: str, cause: str) -> Motion:
     """Return the motion that :func:`motion_arrays` packed."""
+    if cause == "sample":
+        table = arrays[name].T
+        return RigidMotion(translation=table[:, :3], rotation=table[:, 3:6], optics=table[:, 6:])
     u, v, magnification = arrays[name]
     return Motion(shift_u=u, shift_v=v, magnification=magnification, cause=cause)
 

@@ -128,6 +128,10 @@ class RigidMotion(Motion):
         table[:, 2] = depth - near
         return cls.of(geometry, table)
 
+    def columns(self) -> tuple[Floats, ...]:
+        """Return all numbers that tell it from others, those of a view at one place in each."""
+        return (*self.table.T, *self.optics.T)
+
     def with_table(self, table: Floats) -> RigidMotion:
         """Return a motion of the same views with other numbers, (views, 6)."""
         return RigidMotion(translation=table[:, :3], rotation=table[:, 3:], optics=self.optics)

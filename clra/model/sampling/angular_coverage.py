@@ -66,6 +66,12 @@ def covered(geometry: ConeBeamGeometry) -> float:
     return 2 * math.pi - float(np.sum(gaps[_hole(gaps, step)] - step))
 
 
+def fan_angle(geometry: ConeBeamGeometry) -> float:
+    """Return the angle that the columns of a detector span [rad], the median of the views."""
+    width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
+    return 2 * math.atan(0.5 * float(np.median(width)))
+
+
 def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
     """Return a warning if the views of an arc do not measure all rays.
 
@@ -82,8 +88,7 @@ def part_of_a_turn(geometry: ConeBeamGeometry) -> str:
     angle = covered(geometry)
     if geometry.views < 2 or angle == 2 * math.pi or not is_circle(geometry):
         return ""
-    width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
-    half_fan = math.atan(0.5 * float(np.median(width)))
+    half_fan = 0.5 * fan_angle(geometry)
     needed = math.pi + (2 * half_fan if half_fan > _PARALLEL else 0.0)
     if angle > needed - 2 * angle / geometry.views:
         return ""

@@ -121,7 +121,7 @@ class RigidLevel:
         self, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, title: str
     ) -> RigidStep:
         """Sum up the normal equations of each view, and solve them."""
-        stream, mask = self.stream, self.scan.mask
+        stream, mask = self.stream, self.scan.registration_mask
         views, rows, columns = radiographs.shape
         # The registration keeps eight images of a view twice.
         chunks = stream.chunks(views, 2 * IMAGES * radiographs.view_bytes)

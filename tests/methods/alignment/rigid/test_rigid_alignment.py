@@ -1,11 +1,15 @@
 """Rigid motion of the sample is found on closed-form scans."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import clra
-from clra.errors import InputError
+from clra.errors import Cancelled, InputError
+from clra.methods.alignment.result import AlignmentInterrupted
 from clra.methods.alignment.rigid.rigid_solution import solve
+from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
 from clra.model.rigid.rigid_gauge import between, without_rigid_gauge
 from clra.model.rigid.rigid_motion import RigidMotion
@@ -64,10 +68,37 @@ def test_the_alignment_file_keeps_rigid_motion(aligned, tmp_path):
 
 def test_reconstruction_takes_it_and_resampling_refuses_it(scan, aligned):
     sharp = clra.reconstruct(scan[0], alignment=aligned)
-    blurred = clra.reconstruct(scan[0])
-    assert np.square(np.diff(sharp)).sum() > 1.2 * np.square(np.diff(blurred)).sum()
+    moved = clra.Scan(scan[0].projections, scan[0].geometry.with_motion(aligned.motion))
+    grid = default_grid(scan[0].geometry)
+    assert sharp == pytest.approx(clra.reconstruct(moved, grid=grid), abs=1e-4 * float(sharp.max()))
     with pytest.raises(InputError, match="rotations of the sample"):
         clra.correct(scan[0], aligned)
+
+
+def test_checksums_tell_rotations_apart(aligned):
+    table = aligned.motion.table.copy()
+    table[:, 5] *= -1
+    other = replace(aligned, motion=aligned.motion.with_table(table))
+    assert other.checksum_of_motion() != aligned.checksum_of_motion()
+
+
+@pytest.mark.parametrize("error", [Cancelled, KeyboardInterrupt])
+def test_the_shifts_stay_if_it_is_ended_while_it_looks_for_rotations(scan, error):
+    def progress(told):
+        if "rigid" in told.stage:
+            raise error
+
+    def align():
+        return clra.align(scan[0], estimate="rigid", progress=progress, quality=False)
+
+    if error is Cancelled:
+        with pytest.warns(clra.ClraWarning, match="ended early"):
+            kept = align()
+    else:
+        with pytest.raises(AlignmentInterrupted) as stopped:
+            align()
+        kept = stopped.value.result
+    assert kept.motion.cause == "detector" and np.abs(kept.motion.shift_u).max() > 0.5
 
 
 def test_normal_equations_are_solved_view_by_view():
