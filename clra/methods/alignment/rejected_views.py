@@ -34,7 +34,7 @@ _NEIGHBOURS = 9
 # lattice, where 4 leave the worst of six choices 10 % more error in u than no gap would, 6 leave
 # 5 %, 10 no less; on a helix nearly all goes to the two beside it. And the most that each takes: a
 # long gap stays a gap rather than become streaks of the views beside it.
-_NEIGHBOURS, _MOST = 6, 1.0
+_SUBSTITUTES, _MOST = 6, 1.0
 
 
 class Rejections:
@@ -217,7 +217,7 @@ def neighbour_weights(source: Floats, valid_views: NDArray[np.bool_]) -> Floats:
     neighbours = np.flatnonzero(valid_views)
     if len(neighbours) == len(valid_views):
         return weights
-    count = min(_NEIGHBOURS, len(neighbours))
+    count = min(_SUBSTITUTES, len(neighbours))
     distance, nearest = KDTree(source[neighbours]).query(
         source[~valid_views], k=range(1, count + 1)
     )
