@@ -15,7 +15,6 @@ from typing import Any, Literal
 from clra.errors import ClraWarning
 
 Severity = Literal["info", "warning", "error"]
-SEVERITIES: tuple[Severity, ...] = ("info", "warning", "error")
 
 
 @dataclass(frozen=True)

@@ -118,14 +118,18 @@ def matched(
         found = f"{alignment.motion.views} views"
         raise InputError.at(path, "/motion", found, f"{scan.views} as in {scan.name}")
     if alignment.checksum and alignment.checksum != scan.checksum():
-        message = f"{os.fspath(path)} was estimated from other radiographs than those of"
-        Finding("scan", f"{message} {scan.name}").warn()
+        Finding(
+            "scan",
+            f"{os.fspath(path)} was estimated from other radiographs than those of {scan.name}",
+            "go on only if they moved alike, such as two channels of one scan",
+        ).warn()
     told = alignment.about.get("geometry") or geometry
     if told != geometry:
         Finding(
             "geometry",
             f"{os.fspath(path)} was estimated with {told}, and now {scan.name} is read with "
             f"{geometry}: the motion fits one of them only",
+            "give the options that clra align was given",
         ).warn()
     return focused(scan, alignment.about, path)
 

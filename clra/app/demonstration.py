@@ -20,7 +20,7 @@ from clra.model.grid import default_grid
 if TYPE_CHECKING:
     from clra.progress import ProgressCallback
 
-# Chosen so that all of it ends within two minutes on two cores without a GPU.
+# Chosen so that all of it ends within a minute on two cores without a GPU.
 VIEWS, DETECTOR = 360, (256, 192)
 _SHIFT, _MAGNIFICATION, _PHOTONS = (-10.0, 10.0), 0.002, 20000.0
 

@@ -18,8 +18,8 @@ from clra.findings import Finding
 from clra.io.atomic import atomic_path
 from clra.io.damage import reads
 from clra.io.hdf5 import find, open_hdf5, require, text
-from clra.methods.alignment.result import AlignmentResult, Iteration, SupportsAsDict
-from clra.methods.assessment import quality as quality_module
+from clra.methods.alignment.result import AlignmentResult, Iteration
+from clra.methods.assessment.quality import Quality
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 
@@ -294,21 +294,8 @@ def _warnings(file: h5py.File, values: Any, history: Sequence[Iteration]) -> tup
         raise InputError(f"{file.filename}: /warnings: {error}") from error
 
 
-@dataclasses.dataclass(frozen=True)
-class _Values:
-    """A quality of which only plain values are known."""
-
-    values: Mapping[str, Any]
-
-    def as_dict(self) -> dict[str, Any]:
-        return dict(self.values)
-
-
-def _quality(values: Any) -> SupportsAsDict | None:
-    if not isinstance(values, Mapping):
-        return None
-    restore = getattr(quality_module.Quality, "from_dict", _Values)
-    return restore(values)
+def _quality(values: Any) -> Quality | None:
+    return Quality.from_dict(values) if isinstance(values, Mapping) else None
 
 
 def _cause(group: h5py.Group) -> str:

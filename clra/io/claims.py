@@ -36,7 +36,10 @@ class Outputs:
     def check(self, target: Path) -> None:
         """Raise if the file is there and may not be replaced."""
         if not self.overwrite and target not in self.written and target.exists():
-            raise InputError(f"cannot write {target}: it is there already (--no-overwrite)")
+            raise InputError(
+                f"cannot write {target}: it is there already: give another name, or leave out "
+                "--no-overwrite"
+            )
 
 
 _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)

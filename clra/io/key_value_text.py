@@ -65,7 +65,7 @@ class KeyValueText:
         path : Path
             The file.
         separator : str
-            Between key and value; " " stands for any blanks.
+            Between key and value; blanks around it do not matter.
 
         Raises
         ------
@@ -79,7 +79,7 @@ class KeyValueText:
             if line.startswith("[") and line.endswith("]"):
                 current = sections.setdefault(_plain(line[1:-1]), {})
                 continue
-            key, found, value = line.partition(" " if separator == " " else separator)
+            key, found, value = line.partition(separator)
             if found and key.strip() and not line.startswith((";", "#=", "//")):
                 current.setdefault(_plain(key), value.strip())
         return cls(path, sections)

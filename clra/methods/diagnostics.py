@@ -19,10 +19,11 @@ from clra.methods.assessment.quality import Quality
 from clra.methods.assessment.radiograph_checks import radiograph_findings
 from clra.methods.assessment.slice_sharpness import sharpening_by_opposite_rotation
 from clra.methods.reconstruction.fbp import ramp_fbp
+from clra.model.detector_pose import reversed_axes
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import default_grid
 from clra.model.rotation_sense import opposite_rotation
-from clra.model.sampling.angular_coverage import covered
+from clra.model.sampling.angular_coverage import covered, fan_angle
 from clra.model.scan import Scan
 from clra.ops.streaming.multigrid import add_update
 from clra.ops.streaming.radiographs import Radiographs
@@ -138,18 +139,12 @@ def evidence(
     # axis counts in any case, as an alignment makes up for a wrong one.
     if other is not None and other.code != "axis-offset":
         other = other if float(other.measured["otherwise"]) < quality.residual_after else None
-    if other is None and _fan(scan.geometry) < _NARROW:
+    if other is None and fan_angle(scan.geometry) < _NARROW:
         sharper = sharpening_by_opposite_rotation(stream, scan, aligned.motion)
         other = doubted_rotation(sharper) if sharper == sharper else None
     if other is not None:
         quality = replace(quality, verdict="failed", reasons=(other, *quality.reasons))
     return replace(aligned, quality=quality), [*quality.reasons, *findings]
-
-
-def _fan(geometry: ConeBeamGeometry) -> float:
-    """Angle between the outermost columns [rad]."""
-    width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
-    return 2 * math.atan(0.5 * float(np.median(width)))
 
 
 def doubted_rotation(sharpening: float) -> Finding | None:
@@ -196,7 +191,10 @@ def _unexplained(
 
 
 def _hypotheses(geometry: ConeBeamGeometry) -> Iterator[_Hypothesis]:
-    opposite, flipped = opposite_rotation(geometry), _rows_reversed(geometry)
+    opposite = opposite_rotation(geometry)
+    flipped, opposite_flipped = (
+        reversed_axes(base, rows=True, columns=False) for base in (geometry, opposite)
+    )
     yield _Hypothesis(
         "rotation-sense",
         opposite,
@@ -211,12 +209,12 @@ def _hypotheses(geometry: ConeBeamGeometry) -> Iterator[_Hypothesis]:
     )
     yield _Hypothesis(
         "row-order",
-        _rows_reversed(opposite),
+        opposite_flipped,
         "the radiographs fit with their rows in the other order and a sample that turns the other "
         "way",
         "rotate the frames by half a turn, or give the other --rotation and the other row0=",
     )
-    for base in (geometry, opposite, flipped, _rows_reversed(opposite)):
+    for base in (geometry, opposite, flipped, opposite_flipped):
         yield _Hypothesis(
             "transposed",
             _transposed(base),
@@ -285,16 +283,6 @@ def _rotated(geometry: ConeBeamGeometry, angle: Floats) -> ConeBeamGeometry:
     x, y, z = np.split(geometry.to_astra().reshape(-1, 4, 3), 3, axis=2)
     turned = np.concatenate([c * x - s * y, s * x + c * y, z], axis=2)
     return ConeBeamGeometry.from_astra(turned.reshape(-1, 12), geometry.shape)
-
-
-def _rows_reversed(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
-    return ConeBeamGeometry(
-        source=geometry.source,
-        detector=geometry.detector,
-        u=geometry.u,
-        v=-geometry.v,
-        shape=geometry.shape,
-    )
 
 
 def _transposed(geometry: ConeBeamGeometry) -> ConeBeamGeometry:

@@ -83,7 +83,10 @@ def align(
     ] = None,
     volume: Annotated[
         Path | None,
-        typer.Option(metavar="VOLUME", help="imgr: write its volume as well, .h5 or .tif."),
+        typer.Option(
+            metavar="VOLUME",
+            help="imgr: write its volume as well: .h5, .tif, .zarr, .nrrd or .raw.",
+        ),
     ] = None,
 ) -> None:
     """Estimate how each radiograph moved.

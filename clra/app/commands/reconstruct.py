@@ -263,7 +263,6 @@ def reconstruct(
 
 def _start(path: Path, grid: "VolumeGrid") -> Any:
     """Read a volume to start from."""
-    from clra.errors import InputError
     from clra.io.volumes.volume_files import read_volume
 
     volume, found = read_volume(path)

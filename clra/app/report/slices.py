@@ -8,6 +8,7 @@ from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.katsevich import exact_helices, katsevich
 from clra.methods.reconstruction.missing_views import without_gaps
+from clra.model.binning import binned_motion
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -64,11 +65,12 @@ class Slicer:
             whole = without_gaps(scan)
             helical = Radiographs(stream, whole, 1)
             exact_helices(helical, whole.geometry, self.grid)
+            # Rotations of the sample are more than resampling can undo.
+            ideal = corrected(stream, scan, binned_motion(motion, level, before.shape))
         except ValueError:
             self.method = "ramp-filtered back-projection"
             return
         self.method = "Katsevich's method"
-        ideal = corrected(stream, scan, _at_level(motion, before.shape, level))
         self._helical = helical, Radiographs(stream, without_gaps(ideal, valid_views), 1)
         self._geometries = [whole.geometry] * 2
 
@@ -144,14 +146,3 @@ class MultigridSlicer:
 def _upright(volume: Image) -> Image:
     """Image of a volume of one plane or of one row."""
     return np.ascontiguousarray(volume[0] if len(volume) == 1 else volume[::-1, 0])
-
-
-def _at_level(motion: Motion, detector: tuple[int, int], level: int) -> Motion:
-    """Motion in pixels of the binned detector, about whose centre it magnifies."""
-    # Rows and columns that binning drops move the centre by half as much.
-    offset_v, offset_u = (0.5 * (1 - motion.magnification) * (n % level) for n in detector)
-    return Motion(
-        shift_u=(motion.shift_u + offset_u) / level,
-        shift_v=(motion.shift_v + offset_v) / level,
-        magnification=motion.magnification,
-    )

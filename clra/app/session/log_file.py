@@ -43,7 +43,7 @@ def logged(path: Path | None, command: str) -> Iterator[None]:
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        raise OutputError.writing(path, error.errno, error.strerror or str(error)) from error
     handler.setFormatter(logging.Formatter(_FORMAT))
     level, propagate = _LOG.level, _LOG.propagate
     _LOG.addHandler(handler)

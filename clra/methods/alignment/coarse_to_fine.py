@@ -205,14 +205,14 @@ class CoarseToFine:
         ).normalised()
         there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
         step = self.steps.step(self.motion, there)
-        valid_views = np.abs(step[:2, ~self.rejected])
+        update = np.abs(step[:2, ~self.rejected])
         if self.history:
-            note = warned(false_shifts=false_shifts(*self.last, level, valid_views))
+            note = warned(false_shifts=false_shifts(*self.last, level, update))
             self.fresh = bool(note)
         else:
             note = warned(out_of_reach=far_motion(found.motion, level))
             self.fresh = True
-        self.last = level, valid_views
+        self.last = level, update
         # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)

@@ -153,7 +153,7 @@ def assess(
     after = predicted(aligned.motion, True, "after")
     gauge = _Left(scan, scale)
     kept_start = not _better(gauge, before, after)
-    if kept_start and _moved(aligned.motion, start):
+    if kept_start and aligned.motion != start:
         aligned = replace(aligned, motion=start)
         after = predicted(start, True, "start")
     left = gauge.of(after)
@@ -254,10 +254,6 @@ def _better(gauge: _Left, before: Predicted, after: Predicted) -> bool:
     certain = gain.mean() > 2 * gain.std() / np.sqrt(max(1, both.sum() - 1))
     apart = [np.sqrt(np.nanmean(gauge.of(p)[both, :2] ** 2)) for p in (before, after)]
     return bool((certain and gain.mean() > 0) or apart[1] < 0.9 * apart[0])
-
-
-def _moved(motion: Motion, start: Motion) -> bool:
-    return motion != start
 
 
 def _unseen(scan: Scan, truncated: bool) -> float:

@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter
 from clra.errors import InputError
 from clra.findings import Finding
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.sampling.angular_coverage import covered
+from clra.model.sampling.angular_coverage import covered, fan_angle
 from clra.model.scan import Scan
 
 Floats = NDArray[np.float64]
@@ -200,8 +200,7 @@ def _truncation(columns: Floats, most: float, geometry: ConeBeamGeometry) -> Fin
 
 def _arc(geometry: ConeBeamGeometry) -> Finding | None:
     angle = covered(geometry)
-    width = geometry.columns * np.linalg.norm(geometry.u, axis=1) / geometry.source_to_detector
-    fan = 2 * math.atan(0.5 * float(np.median(width)))
+    fan = fan_angle(geometry)
     if angle >= math.pi + fan or geometry.views < 2:
         return None
     return Finding(

@@ -34,7 +34,7 @@ ESTIMATE_FIELDS = (
 SMALLEST = 16
 """Fewest rows and columns of images that can be registered."""
 
-# As kernels/registration.cl has them: floats of a view's state, sums of its normal equations.
+# As gauss_newton.clh has them: floats of a view's state, sums of its normal equations.
 _STATE, _SUMS = 8, 36
 
 # Sigmas by which the measured image is blurred further, pixels, to resemble the simulated one. The

@@ -164,7 +164,7 @@ class SlabMoments(SlabProjector):
     _PROJECTOR = MomentProjector
 
     def moments(self, projections_out: Array, over_depth_out: Array, views: slice) -> cl.Event:
-        """Project some views; arrays as for `MomentProjector.moments`."""
+        """Project some views; arrays as for `MomentProjector`."""
         return self._over_slabs((projections_out, over_depth_out), views)
 
 

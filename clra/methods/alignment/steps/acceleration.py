@@ -26,7 +26,7 @@ class Anderson:
     memory : int
         Differences kept; 0 leaves the iteration plain.
     floor : float
-        Steps below this length are always valid_views, in the units of x.
+        Steps below this length are always accepted, in the units of x.
 
     References
     ----------
