@@ -42,9 +42,14 @@ kernel required_group void weigh_rays(
 
 // What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, z) on.
 always_inlined void add_columns(
-    const pencil s, const int p, const float x, const float y, const float z, float *sum)
+    const pencil s,
+    global const float *m, // the view
+    const int p,
+    const float x,
+    const float y,
+    const float z,
+    float *sum)
 {
-    global const float *m = s.view;
     const int q = 1 - p, columns = s.columns, rows = s.rows;
     const float at_p = p ? y : x, at_q = p ? x : y;
     const float a = fma(m[0], x, fma(m[1], y, m[3])), g = fma(m[8], x, fma(m[9], y, m[11]));
@@ -136,13 +141,13 @@ kernel required_group void adjoint_axial(
         sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
         global const float *m = views + view * VIEW_FLOATS;
-        const pencil s = {m, projections + (size_t)view * (rows * COLUMNS), columns, rows};
+        const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
         // A ray that shares in a voxel passes its plane within one voxel.
         const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]);
         if (far_x + (1.0f + SLACK) >= far_y)
-            add_columns(s, 0, x, y, z, sum);
+            add_columns(s, m, 0, x, y, z, sum);
         if (far_y + (1.0f + SLACK) >= far_x)
-            add_columns(s, 1, x, y, z, sum);
+            add_columns(s, m, 1, x, y, z, sum);
     }
     put(volume + ((size_t)y * nx + x) * nz + z, sum, nz - z, accumulate);
 }
@@ -212,7 +217,7 @@ kernel required_group void adjoint_voxels(
     float sum = 0.0f;
     for (int view = 0; view < count; ++view) {
         LOAD_VIEW(m, views + view * VIEW_FLOATS);
-        const pencil s = {views, projections + (size_t)view * (rows * COLUMNS), columns, rows};
+        const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
         const float g = AT(m + 8, x, y, z), scale = reciprocal(g);
         const float column = AT(m, x, y, z) * scale, row = AT(m + 4, x, y, z) * scale;
         // A ray that shares in a voxel passes its plane within one voxel.

@@ -142,7 +142,7 @@ kernel required_group void adjoint_leaning(
         sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
         LOAD_VIEW(m, views + view * VIEW_FLOATS);
-        const pencil s = {views, projections + (size_t)view * (rows * COLUMNS), columns, rows};
+        const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
         // A ray that shares in a voxel passes its plane within one voxel.
         const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]);
         const int x_too = far_x + (1.0f + SLACK) >= far_y, y_too = far_y + (1.0f + SLACK) >= far_x;

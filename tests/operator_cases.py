@@ -262,6 +262,7 @@ WITH_SCRATCH = (
     "tilted back",
     "tilted adjoint",
     "steep adjoint",
+    "moments",
     "katsevich",
     "pi back",
     "ramp",

@@ -131,7 +131,7 @@ class CpuForward:
     ) -> cl.Event:
         """Do so with one image a view, or two; lines of the second follow all of the first."""
         layout = self._layout
-        for first, last in layout.batches(views.stop - views.start, len(outputs)):
+        for first, last in layout.batches(views.stop - views.start):
             lines = layout.scratch_projections(len(outputs) * (last - first))
             for planes in self._parts:
                 event = self._project(

@@ -1,7 +1,6 @@
 """The projectors' kernels for GPUs, which take projections in the caller's order."""
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -59,24 +58,17 @@ class GpuForward:
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        self._prepared = self._step
+        self._steps: dict[str, Step] = {}
+        self._step()
 
-    @cached_property
-    def _axial(self) -> Step:
-        defines = {**size_constants(self._layout, volume=True), "RAYS": _RAYS}
-        return self._built("forward_axial", defines)
-
-    @cached_property
-    def _rays(self) -> Step:
-        return self._built("forward_rays", size_constants(self._layout, volume=True))
-
-    def _built(self, kernel: str, defines: dict[str, object]) -> Step:
-        context = self._layout.context
-        return Step(context, "forwardproject.cl", kernel, _GROUP, defines)
-
-    @property
     def _step(self) -> Step:
-        return self._axial if self._layout.columnar else self._rays
+        """Build what is needed, when it is."""
+        layout = self._layout
+        kernel = "forward_axial" if layout.columnar else "forward_rays"
+        if kernel not in self._steps:
+            defines = {**size_constants(layout, volume=True), "RAYS": _RAYS}
+            self._steps[kernel] = Step(layout.context, "forwardproject.cl", kernel, _GROUP, defines)
+        return self._steps[kernel]
 
     def __call__(
         self,
@@ -92,7 +84,7 @@ class GpuForward:
         columns, rows, _ = layout.detector
         span = -(-rows // (32 * _RAYS)) * 32 if layout.columnar else rows
         for part in runs(layout, views):
-            event = self._step(
+            event = self._step()(
                 queue,
                 (span, columns, part.stop - part.start),
                 projections[part.start - views.start : part.stop - views.start],
@@ -115,24 +107,17 @@ class GpuBack:
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
-        self._prepared = self._step
+        self._steps: dict[str, Step] = {}
+        self._step()
 
-    @cached_property
-    def _axial(self) -> Step:
-        return self._built("backproject_axial")
-
-    @cached_property
-    def _voxels(self) -> Step:
-        return self._built("backproject_voxels")
-
-    def _built(self, kernel: str) -> Step:
-        defines = {**size_constants(self._layout), "VOXELS": _VOXELS}
-        context = self._layout.context
-        return Step(context, "backproject.cl", kernel, _GROUP, defines)
-
-    @property
     def _step(self) -> Step:
-        return self._axial if self._layout.columnar else self._voxels
+        """Build what is needed, when it is."""
+        layout = self._layout
+        kernel = "backproject_axial" if layout.columnar else "backproject_voxels"
+        if kernel not in self._steps:
+            defines = {**size_constants(layout), "VOXELS": _VOXELS}
+            self._steps[kernel] = Step(layout.context, "backproject.cl", kernel, _GROUP, defines)
+        return self._steps[kernel]
 
     def __call__(
         self,
@@ -156,7 +141,7 @@ class GpuBack:
             wait_for = layout.last = [event]
             accumulate = True
         for part, bottom, top in launches:
-            event = self._step(
+            event = self._step()(
                 queue,
                 (nx, ny, -(-(top - bottom) // _VOXELS)),
                 volume,

@@ -45,6 +45,8 @@ class Layout:
     weighs : bool
         Whether projections are changed before they are used, so that a GPU too needs scratch for
         them; CPUs always do.
+    images : int
+        Projections that a view gives at a time.
 
     Attributes
     ----------
@@ -82,6 +84,7 @@ class Layout:
         scratch_limit: int | None = None,
         *,
         weighs: bool = False,
+        images: int = 1,
     ) -> None:
         self.profile = profile = profile_of(context)
         self.context = context
@@ -101,7 +104,8 @@ class Layout:
         self._lines: Array | None = None
         self._volume: Array | None = None
         self._memory = Scratch(context, allocator)
-        lines = min(geometry.views, self._most) * self._view_elements
+        self._images = images
+        lines = images * min(geometry.views, self._most) * self._view_elements
         self.scratch_bytes = 4 * (lines + _PIECE) if profile.on_cpu or weighs else 0
         if volume_order == "zyx":
             self.scratch_bytes += 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -135,12 +139,13 @@ class Layout:
 
     @property
     def _most(self) -> int:
-        """Views that one launch treats."""
-        return max(self._least, self._bytes // (4 * self._view_elements))
+        """Most views that one launch treats."""
+        images = max(self._least, self._bytes // (4 * self._view_elements))
+        return max(1, images // self._images)
 
-    def batches(self, count: int, images: int = 1) -> Iterator[tuple[int, int]]:
-        """Cut `count` views, of some images each, into runs that fit the scratch."""
-        runs = -(-count // max(1, self._most // images))
+    def batches(self, count: int) -> Iterator[tuple[int, int]]:
+        """Cut `count` views into runs that fit the scratch."""
+        runs = -(-count // self._most)
         for run in range(runs):
             yield count * run // runs, count * (run + 1) // runs
 

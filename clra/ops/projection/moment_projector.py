@@ -48,7 +48,9 @@ class MomentProjector:
         allocator: Allocator | None = None,
         scratch_limit: int | None = None,
     ) -> None:
-        self._layout = Layout(context, geometry, grid, volume_order, allocator, scratch_limit)
+        self._layout = Layout(
+            context, geometry, grid, volume_order, allocator, scratch_limit, images=2
+        )
         self.scratch_bytes = self._layout.scratch_bytes
         on_cpu = self._layout.profile.on_cpu
         self._project = CpuForward(self._layout, {"MOMENT": 1}) if on_cpu else _Rays(self._layout)

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
 from clra.errors import InputError
 from clra.ops.images.bandpass import Bandpass
 from clra.ops.images.blur import Blur
 from clra.ops.registration.phase_correlation import CoarseShift, check_pair
-from clra.ops.registration.windows import registration_window
+from clra.ops.registration.windows import box, registration_window
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
 from clra.ops.runtime.kernel import Step, group
 from clra.ops.runtime.lines import line_stride, lined
@@ -182,7 +182,7 @@ class Registration:
         weights = registration_window(shape, margin, low_pass, mask)
         valid = np.ones(shape) if mask is None else np.asarray(mask) != 0
         self._window, self._valid = (to_device(context, lined(image)) for image in (weights, valid))
-        self._box = _box(weights)
+        self._box = box(weights)
         self._blocks = -(-(self._box[1] - self._box[0]) // _BLOCK_ROWS)
         self._coarse = (
             CoarseShift(context, weights, views=views, max_shift=max_shift, allocator=memory)
@@ -326,9 +326,3 @@ class Registration:
                 wait_for=[event],
             )
         return event
-
-
-def _box(weights: NDArray[np.float64]) -> tuple[int, int, int, int]:
-    """First row, one past the last, first column, one past the last that count."""
-    rows, columns = np.flatnonzero(weights.any(1)), np.flatnonzero(weights.any(0))
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1

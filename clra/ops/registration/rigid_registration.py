@@ -11,7 +11,7 @@ from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.rigid.rigid_motion import turning_axes, view_axes
 from clra.ops.images.bandpass import Bandpass
-from clra.ops.registration.windows import registration_window
+from clra.ops.registration.windows import box, registration_window
 from clra.ops.runtime.buffers import (
     Allocator,
     Scratch,
@@ -100,8 +100,8 @@ class RigidRegistration:
         weights = registration_window(shape, margin, low_pass, mask)
         self.total_weight = float(weights.sum())
         self._weights = to_device(context, weights)
-        self._rows, self._columns = (np.flatnonzero(weights.any(axis=axis)) for axis in (1, 0))
-        self._blocks = -(-(int(self._rows[-1]) + 1 - int(self._rows[0])) // _BLOCK_ROWS)
+        self._box = box(weights)
+        self._blocks = -(-(self._box[1] - self._box[0]) // _BLOCK_ROWS)
         self._images, self._banded = (memory.empty((views, IMAGES, *shape)) for _ in range(2))
         self._sums = memory.empty((views, self._blocks, self._strands, PRODUCTS))
         defines = {"LANES": 8 if cpu else 1}
@@ -178,8 +178,7 @@ class RigidRegistration:
             queue,
             (self._strands, self._blocks, n),
             *(self._sums, self._banded, self._weights, columns, rows),
-            *(int(self._rows[0]), int(self._rows[-1]) + 1),
-            *(int(self._columns[0]), int(self._columns[-1]) + 1),
+            *self._box,
             *(_BLOCK_ROWS, self._blocks, self._strands, n),
             wait_for=[event],
         )

@@ -65,3 +65,9 @@ def registration_window(
 def _rise(x: Floats) -> Floats:
     """Rise from 0 at 0 to 1 at 1, as a raised cosine."""
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip(x, 0, 1)))
+
+
+def box(weights: Floats) -> tuple[int, int, int, int]:
+    """First row, one past the last, first column, one past the last that count."""
+    rows, columns = np.flatnonzero(weights.any(1)), np.flatnonzero(weights.any(0))
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
