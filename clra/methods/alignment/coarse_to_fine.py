@@ -25,7 +25,8 @@ from clra.methods.alignment.rejected_views import Rejections
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
 from clra.methods.alignment.steps.acceleration import MotionSteps
-from clra.methods.alignment.steps.slow_modes import SlowSteps, held
+from clra.methods.alignment.steps.moved_sample import MovedSample
+from clra.methods.alignment.steps.slow_modes import SlowSteps, held, slow_part
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     history_from,
@@ -42,6 +43,10 @@ from clra.model.schedule import Stage, converged, level_name, update_size
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
+
+# Most iterations of a level in which small images tell magnifications without a prior: two find
+# where the sample stands, a third that it stays.
+_PROBES = 3
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,6 +94,9 @@ class CoarseToFine:
     history: list[Iteration] = field(init=False, default_factory=list)
     registered: Registered = field(init=False)
     found: Motion = field(init=False)  # by the last iteration, with its gauge
+    origin: Motion = field(init=False)  # whose gauge stays
+    displaced: bool = field(init=False, default=False)  # the sample, by the last iteration
+    probing: bool = field(init=False, default=False)  # magnifications are told by each view alone
     last: tuple[int, Floats] = field(init=False)  # its level, and updates of valid views
     fresh: bool = field(init=False)  # nothing was known of the motion before it
     steps: MotionSteps = field(init=False)  # of the level
@@ -104,6 +112,8 @@ class CoarseToFine:
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
         # magnifications of several per cent.
         self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
+        self.origin = self.start
+        self.sample = MovedSample(self.scan.geometry, self.region.sample)
 
     def align(self, stages: Sequence[Stage], saved: Saved | None = None) -> None:
         """Go through the levels, or what is left of them; what an interruption leaves is kept."""
@@ -133,11 +143,12 @@ class CoarseToFine:
             self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
         # that one, its first steps would go astray.
-        steps = self.solver.acceleration()
-        self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
-        slow, previous = SlowSteps(), None
+        self.steps = self._new_steps()
+        slow, previous, probes = SlowSteps(), None, 0
         for iteration in range(done + 1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
+            self.probing = self._probe(stage.level, probes)
+            probes += self.probing
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(level, title=of)
             wrong = self.rejections.of(found.correlation) & ~self.rejected
@@ -165,6 +176,7 @@ class CoarseToFine:
             update_u, update_v = update[:, ~self.rejected]
             ended = (
                 stage.iterations is None
+                and not self.displaced
                 and left < stage.slow
                 and converged(update_u, update_v, previous, stage.tolerance)
             )
@@ -190,6 +202,7 @@ class CoarseToFine:
             magnification=self.scale and not shifts_only,
             measure=not shifts_only,
             title=title,
+            pulled=not self.probing,
         )
 
     def _move(self, found: Registered, level: int) -> tuple[Floats, str]:
@@ -203,7 +216,7 @@ class CoarseToFine:
         self.found = self.rejections.settled(
             self.motion, there, self.rejected, first=not self.history
         ).normalised()
-        there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
+        there = self.shift_gauge.anchored(self.found, self.origin) if self.anchor else self.found
         step = self.steps.step(self.motion, there)
         update = np.abs(step[:2, ~self.rejected])
         if self.history:
@@ -213,19 +226,56 @@ class CoarseToFine:
             note = warned(out_of_reach=far_motion(found.motion, level))
             self.fresh = True
         self.last = level, update
+        aside = self._aside(found, level)
+        self.displaced = aside is not None
+        if aside is not None:
+            # Points at other depths shift anew: nothing to extrapolate from, either.
+            self.origin, there = aside.then(self.origin), aside.then(there)
+            self.steps, self.fresh = self._new_steps(), True
         # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
         return step, note
 
+    def _new_steps(self) -> MotionSteps:
+        return MotionSteps(self.solver.acceleration(), self.scan.geometry.shape, self.scale)
+
+    def _probe(self, level: int, probes: int) -> bool:
+        """Whether small images shall tell where the sample stands: once, and until it stays."""
+        again = probes == 0 or (self.displaced and probes < _PROBES)
+        pull = self.solver.pull(self.scan.geometry.binned(level).shape)
+        if not (again and pull and self.history and self._may_displace):
+            return False
+        drift = slow_part(self.motion.shift_u, (~self.rejected).astype(np.float64))
+        return self.sample.doubt(drift) > self.solver.spread
+
+    @property
+    def _may_displace(self) -> bool:
+        known = self.start.cause != "detector" or not self.solver.spread
+        return self.scale and self.anchor and not known
+
+    def _aside(self, found: Registered, level: int) -> Motion | None:
+        """Motion that puts the sample on the axis, where magnifications tell that it is beside."""
+        pull = 0.0 if self.probing else self.solver.pull(self.scan.geometry.binned(level).shape)
+        if pull or not self._may_displace:
+            return None
+        told = ~self.rejected & (found.sigma[:, 2] > 0)
+        there = self.motion.then(found.motion).magnification / self.start.magnification
+        sigma = np.where(told, found.sigma[:, 2], np.inf)
+        return self.sample.aside(np.log(there), sigma, self.solver.spread)
+
     def _held(self, motion: Motion, found: Registered, level: int) -> Motion:
         """Pull magnifications to those expected, where registration did not."""
-        spread = self.solver.jitter(self.scan.geometry.binned(level).shape)
-        if not (self.scale and spread):
+        shape = self.scan.geometry.binned(level).shape
+        jitter, pull = self.solver.jitter(shape), self.solver.pull(shape)
+        if not (self.scale and (jitter or (pull and self.probing))):
             return motion
         expected = np.log(self.start.magnification)
         logarithm = np.log(motion.magnification) - expected
-        pulled = held(logarithm, found.sigma[:, 2], spread)
+        if jitter:
+            pulled = held(logarithm, found.sigma[:, 2], jitter)
+        else:
+            pulled = logarithm * pull**2 / (pull**2 + found.sigma[:, 2] ** 2)
         return replace(motion, magnification=np.exp(pulled + expected))
 
     def _keep(self, stage: int, done: int) -> None:
@@ -243,6 +293,7 @@ class CoarseToFine:
             return
         level, update = self.last
         arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
+        arrays |= motion_arrays("origin", self.origin)
         arrays |= {"rejected": self.rejected, "update": update}
         arrays["accepted"] = self.rejections.accepted
         values = {
@@ -261,6 +312,7 @@ class CoarseToFine:
         arrays, values, cause = saved.arrays, saved.values, self.start.cause
         self.motion = motion_from(arrays, "motion", cause)
         self.found = motion_from(arrays, "found", cause)
+        self.origin = motion_from(arrays, "origin", cause)
         self.rejected, self.fresh = arrays["rejected"], values["fresh"]
         self.rejections.accepted = arrays["accepted"].astype(np.bool_)
         self.rejections.reasons = {int(view): reason for view, reason in values["reasons"]}

@@ -69,6 +69,7 @@ class Level:
         magnification: bool,
         measure: bool,
         title: str,
+        pulled: bool = True,
     ) -> Registered:
         """Reconstruct, simulate and register: what is left of the motion.
 
@@ -88,6 +89,8 @@ class Level:
             Whether to find the bias, if it is not known and images are so small that it counts.
         title : str
             What progress reports begin with.
+        pulled : bool
+            Whether magnifications of small images are pulled to what is expected.
         """
         # Motions are in full-resolution pixels: absorb first, then bin.
         geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
@@ -120,6 +123,7 @@ class Level:
                     radiographs,
                     first=first,
                     magnification=magnification,
+                    pulled=pulled,
                 ),
                 magnification=known,
                 detector=self.scan.geometry.shape,
