@@ -1,5 +1,6 @@
 """Which cluster is meant: a client of Dask, or a text that says how to get one."""
 
+import logging
 import os
 import re
 import shutil
@@ -111,6 +112,7 @@ def _local(workers: int) -> Iterator[Any]:
             processes=True,
             memory_limit=None,  # clra keeps to its own budgets
             dashboard_address=None,
+            silence_logs=logging.ERROR,
             local_directory=folder,
         ) as cluster:
             yield cluster

@@ -11,20 +11,24 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from clra.errors import ClusterError, DeviceError, InputError
 from clra.findings import Finding
 from clra.methods.execution.executor import Item, Result, Task
 from clra.methods.execution.travelling import Shared, write_task
-from clra.methods.execution.worker_process import Facts, Outcome, Settings, facts, run
+from clra.methods.execution.worker_process import Outcome, Settings, WorkerFacts, facts, run
 from clra.progress import ProgressCallback, tell
 
 _LOG = logging.getLogger(__name__)
 # How often a task may fail: a full disk or a lost mount may be gone the next time, a bug is not.
 _TRIES = 3
+# How often a task may be begun, whose result is lost with a worker before it is fetched.
+_BEGUN = 10
 # Seconds between two looks at the workers, and for which there may be none.
 _LOOK, _PATIENCE = 5.0, 300.0
 # Part of the memory that is free on a machine that its workers may use.
@@ -131,37 +135,40 @@ class DaskCluster:
         path = self.folder / f"task-{self._number:05}"
         self._number += 1
         write_task(path, task)
-        waiting = _Waiting(self, str(path), stage)
+        waiting = _Waiting(self, str(path), items, stage)
         results: dict[int, Any] = {}
         try:
-            for number, item in enumerate(items):
-                waiting.add(number, item)
-            tell(self._progress, stage, 0, len(items))
+            for number in range(len(items)):
+                waiting.add(number)
             while waiting.futures:
-                for number, outcome in waiting.finished():
-                    if outcome.error is not None:
-                        self._failed(waiting, number, items[number], outcome)
-                        continue
-                    for finding in outcome.findings:
-                        finding.warn()
-                    results[number] = outcome.result
-                    if done is not None:
-                        done(number)
-                    tell(self._progress, stage, len(results), len(items))
+                tell(self._progress, stage, len(results), len(items))
+                ready = waiting.next()
+                if ready is None:
+                    continue
+                number, outcome = ready
+                if outcome.error is not None:
+                    self._failed(waiting, number, outcome)
+                    continue
+                for finding in outcome.findings:
+                    finding.warn()
+                results[number] = outcome.result
+                if done is not None:
+                    done(number)
+            tell(self._progress, stage, len(items), len(items))
         finally:
             waiting.cancel()
         path.unlink(missing_ok=True)
         return [results[number] for number in range(len(items))]
 
-    def _failed(self, waiting: "_Waiting", number: int, item: Any, outcome: Outcome) -> None:
+    def _failed(self, waiting: "_Waiting", number: int, outcome: Outcome) -> None:
         """Try again, on another worker if it is this one's device that fails; or give up."""
         error = outcome.error
         assert error is not None
-        waiting.tries[number] += 1
+        waiting.failed[number] += 1
         if isinstance(error, DeviceError):
             self.refuse(outcome.address, f"{outcome.worker}: {error}")
-        if waiting.tries[number] < _TRIES:
-            waiting.add(number, item)
+        if waiting.failed[number] < _TRIES:
+            waiting.add(number)
             return
         where = f"{waiting.stage}: task {number + 1} on worker {outcome.worker}"
         _LOG.error("%s\n%s", where, outcome.trace)
@@ -184,7 +191,7 @@ class DaskCluster:
             return None
         return [address for address in self._client.nthreads() if address not in self._refused]
 
-    def _known_workers(self) -> dict[str, Facts]:
+    def _known_workers(self) -> dict[str, WorkerFacts]:
         """Ask all workers; those without a device are refused."""
         token = self.folder / "seen"
         token.touch()
@@ -206,10 +213,8 @@ class DaskCluster:
                 self.refuse(address, f"{address}: {fact.failure}")
         return usable
 
-    def _asked(self, addresses: list[str], token: str) -> dict[str, Facts]:
+    def _asked(self, addresses: list[str], token: str) -> dict[str, WorkerFacts]:
         """Return what workers answer; any that is lost meanwhile does not."""
-        import distributed
-
         neighbours = max(Counter(_host(address) for address in addresses).values())
         asked = {
             self._client.submit(
@@ -222,12 +227,16 @@ class DaskCluster:
             ): address
             for number, address in enumerate(addresses)
         }
-        with suppress(TimeoutError, distributed.TimeoutError):
-            distributed.wait(list(asked), timeout=_PATIENCE)
+        ready = _Ready()
+        for future in asked:
+            ready.watch(future)
+        with suppress(Empty):
+            for _ in asked:
+                ready.get(_PATIENCE)
         answers = {a: future.result() for future, a in asked.items() if future.status == "finished"}
         for future, address in asked.items():
             if future.status == "error":
-                answers[address] = Facts("", failure=str(future.exception()))
+                answers[address] = WorkerFacts("", failure=str(future.exception()))
         self._client.cancel(list(asked))
         return answers
 
@@ -235,49 +244,51 @@ class DaskCluster:
 class _Waiting:
     """The tasks of one call that are not done yet."""
 
-    def __init__(self, cluster: DaskCluster, path: str, stage: str) -> None:
+    def __init__(self, cluster: DaskCluster, path: str, items: Sequence[Any], stage: str) -> None:
         self.stage = stage
         self.futures: dict[Any, int] = {}
-        self.tries: Counter[int] = Counter()
+        self.begun: Counter[int] = Counter()
+        self.failed: Counter[int] = Counter()
+        self._items = items
         self._cluster, self._path = cluster, path
         self._seen = time.monotonic()
+        self._ready = _Ready()
 
-    def add(self, number: int, item: Any) -> None:
+    def add(self, number: int) -> None:
         """Hand a task in."""
         cluster = self._cluster
+        self.begun[number] += 1
         # Dask's dashboard shows the words before the number.
         words = "-".join(self.stage.replace(":", " ").split())
         name = Path(self._path).name.removeprefix("task-")
         future = cluster._client.submit(
             run,
             self._path,
-            item,
+            self._items[number],
             cluster._settings,
-            key=f"{words}-{cluster._session}-{name}-{number}-{self.tries[number]}",
+            key=f"{words}-{cluster._session}-{name}-{number}-{self.begun[number]}",
             pure=False,
             priority=-number,
             workers=cluster.usable(),
         )
         self.futures[future] = number
+        self._ready.watch(future)
 
-    def finished(self) -> list[tuple[int, Outcome]]:
-        """Wait for a while; return what was done meanwhile."""
-        import distributed
-
+    def next(self) -> tuple[int, Outcome] | None:
+        """Wait for a while; return the next task that is done, if any."""
         try:
-            ready = distributed.wait(
-                list(self.futures), timeout=_LOOK, return_when="FIRST_COMPLETED"
-            )
-        except (TimeoutError, distributed.TimeoutError):
+            future = self._ready.get(_LOOK)
+        except Empty:
             self._look()
-            return []
+            return None
         self._seen = time.monotonic()
-        found = []
-        for future in ready.done:
-            number = self.futures.pop(future)
-            found.append((number, self._outcome(future, number)))
-            future.release()
-        return found
+        number = self.futures.pop(future)
+        outcome = self._outcome(future, number)
+        future.release()
+        if outcome is None:
+            self.add(number)
+            return None
+        return number, outcome
 
     def cancel(self) -> None:
         """Take back what is not done."""
@@ -285,21 +296,22 @@ class _Waiting:
             self._cluster._client.cancel(list(self.futures), force=True)
             self.futures.clear()
 
-    def _outcome(self, future: Any, number: int) -> Outcome:
+    def _outcome(self, future: Any, number: int) -> Outcome | None:
+        """Return what became of a task; None if that was lost with its worker."""
         from distributed.scheduler import KilledWorker
 
         what = f"{self.stage}: task {number + 1}"
-        if future.status in ("cancelled", "lost"):
-            raise ClusterError(f"{what}: the scheduler was lost, or dropped it")
-        error = future.exception()
-        if isinstance(error, KilledWorker):
+        try:
+            outcome: Outcome = future.result()
+        except KilledWorker as error:
             raise ClusterError(
                 f"{what}: its workers were killed each time, the last of them {error.last_worker}: "
                 "look for a lack of memory there (--max-host-memory)"
             ) from error
-        if error is not None:
-            raise ClusterError(f"{what}: {type(error).__name__}: {error}") from error
-        outcome: Outcome = future.result()
+        except CancelledError:
+            if self._cluster._client.status != "running" or self.begun[number] > _BEGUN:
+                raise ClusterError(f"{what}: the scheduler was lost") from None
+            return None
         return outcome
 
     def _look(self) -> None:
@@ -311,6 +323,21 @@ class _Waiting:
             raise ClusterError(
                 f"{self.stage}: no worker with a device for {_PATIENCE:.0f} s: start some"
             )
+
+
+class _Ready:
+    """Futures as they are done, of any client."""
+
+    def __init__(self) -> None:
+        self._done: SimpleQueue[Any] = SimpleQueue()
+
+    def watch(self, future: Any) -> None:
+        """Wait for a future as well."""
+        future.add_done_callback(self._done.put)
+
+    def get(self, seconds: float) -> Any:
+        """Return the next one, or raise Empty."""
+        return self._done.get(timeout=seconds)
 
 
 def _host(address: str) -> str:

@@ -25,7 +25,7 @@ _streams: dict[tuple[int, int], Any] = {}
 
 
 @dataclass(frozen=True)
-class Facts:
+class WorkerFacts:
     """What a worker has to work with.
 
     Attributes
@@ -94,7 +94,7 @@ class Outcome:
     trace: str = ""
 
 
-def facts(neighbours: int, shared_file: str) -> Facts:
+def facts(neighbours: int, shared_file: str) -> WorkerFacts:
     """Look at the worker that this runs in.
 
     Parameters
@@ -112,12 +112,12 @@ def facts(neighbours: int, shared_file: str) -> Facts:
 
         host = platform.node()
         if not Path(shared_file).is_file():
-            return Facts(host, failure=f"it does not see {shared_file}")
+            return WorkerFacts(host, failure=f"it does not see {shared_file}")
         try:
             device = _device()
         except DeviceError as error:
-            return Facts(host, failure=str(error))
-        return Facts(
+            return WorkerFacts(host, failure=str(error))
+        return WorkerFacts(
             host,
             device.name.strip(),
             device_memory=device.global_mem_size,
