@@ -12,16 +12,16 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
-from contextlib import suppress
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import Any
 
 from clra.errors import ClusterError, DeviceError, InputError
 from clra.findings import Finding
 from clra.methods.execution.executor import Item, Result, Task
 from clra.methods.execution.travelling import Shared, write_task
-from clra.methods.execution.worker_process import Outcome, Settings, WorkerFacts, facts, run
+from clra.methods.execution.worker_facts import LOOK, PATIENCE, Ready, known_workers
+from clra.methods.execution.worker_process import Outcome, Settings, run
 from clra.progress import ProgressCallback, tell
 
 _LOG = logging.getLogger(__name__)
@@ -29,8 +29,6 @@ _LOG = logging.getLogger(__name__)
 _TRIES = 3
 # How often a task may be begun, whose result is lost with a worker before it is fetched.
 _BEGUN = 10
-# Seconds between two looks at the workers, and for which there may be none.
-_LOOK, _PATIENCE = 5.0, 300.0
 # Part of the memory that is free on a machine that its workers may use.
 _HOST_PART = 0.5
 
@@ -78,10 +76,16 @@ class DaskCluster:
         self._number = 0
         self._refused: set[str] = set()
         try:
-            known = self._known_workers()
+            token = self.folder / "seen"
+            token.touch()
+            found = known_workers(client, token, self._session, progress)
+            for address, fact in found.items():
+                if fact.failure:
+                    self.refuse(address, f"{address}: {fact.failure}")
         except BaseException:
             self.close()
             raise
+        known = {address: fact for address, fact in found.items() if not fact.failure}
         self.places = len(known)
         hosts = Counter(fact.host for fact in known.values())
         device = min(fact.device_memory for fact in known.values()) * 3 // 4
@@ -191,55 +195,6 @@ class DaskCluster:
             return None
         return [address for address in self._client.nthreads() if address not in self._refused]
 
-    def _known_workers(self) -> dict[str, WorkerFacts]:
-        """Ask all workers; those without a device are refused."""
-        token = self.folder / "seen"
-        token.touch()
-        started = time.monotonic()
-        while not (addresses := list(self._client.nthreads())):
-            if time.monotonic() - started > _PATIENCE:
-                raise ClusterError(f"no worker within {_PATIENCE:.0f} s: start some")
-            tell(self._progress, "waiting for workers", 0, 1)
-            time.sleep(0.2)
-        found = self._asked(addresses, str(token))
-        usable = {address: fact for address, fact in found.items() if not fact.failure}
-        if not usable:
-            why = next((f"worker {a}: {f.failure}" for a, f in found.items()), "no worker answers")
-            if any(str(token) in fact.failure for fact in found.values()):
-                raise InputError(f"{self.folder}: {why}: expected a folder that all workers share")
-            raise DeviceError(f"no worker with a device: {why}")
-        for address, fact in found.items():
-            if fact.failure:
-                self.refuse(address, f"{address}: {fact.failure}")
-        return usable
-
-    def _asked(self, addresses: list[str], token: str) -> dict[str, WorkerFacts]:
-        """Return what workers answer; any that is lost meanwhile does not."""
-        neighbours = max(Counter(_host(address) for address in addresses).values())
-        asked = {
-            self._client.submit(
-                facts,
-                neighbours,
-                token,
-                key=f"looking-at-the-device-{self._session}-{number}",
-                workers=[address],
-                pure=False,
-            ): address
-            for number, address in enumerate(addresses)
-        }
-        ready = _Ready()
-        for future in asked:
-            ready.watch(future)
-        with suppress(Empty):
-            for _ in asked:
-                ready.get(_PATIENCE)
-        answers = {a: future.result() for future, a in asked.items() if future.status == "finished"}
-        for future, address in asked.items():
-            if future.status == "error":
-                answers[address] = WorkerFacts("", failure=str(future.exception()))
-        self._client.cancel(list(asked))
-        return answers
-
 
 class _Waiting:
     """The tasks of one call that are not done yet."""
@@ -247,12 +202,13 @@ class _Waiting:
     def __init__(self, cluster: DaskCluster, path: str, items: Sequence[Any], stage: str) -> None:
         self.stage = stage
         self.futures: dict[Any, int] = {}
+        self._where: dict[Any, list[str] | None] = {}
         self.begun: Counter[int] = Counter()
         self.failed: Counter[int] = Counter()
         self._items = items
         self._cluster, self._path = cluster, path
         self._seen = time.monotonic()
-        self._ready = _Ready()
+        self._ready = Ready()
 
     def add(self, number: int) -> None:
         """Hand a task in."""
@@ -269,19 +225,21 @@ class _Waiting:
             key=f"{words}-{cluster._session}-{name}-{number}-{self.begun[number]}",
             pure=False,
             priority=-number,
-            workers=cluster.usable(),
+            workers=(where := cluster.usable()),
         )
-        self.futures[future] = number
+        self.futures[future], self._where[future] = number, where
         self._ready.watch(future)
 
     def next(self) -> tuple[int, Outcome] | None:
         """Wait for a while; return the next task that is done, if any."""
         try:
-            future = self._ready.get(_LOOK)
+            future = self._ready.get(LOOK)
         except Empty:
             self._look()
             return None
         self._seen = time.monotonic()
+        if future not in self.futures:
+            return None  # it was handed in again
         number = self.futures.pop(future)
         outcome = self._outcome(future, number)
         future.release()
@@ -315,31 +273,18 @@ class _Waiting:
         return outcome
 
     def _look(self) -> None:
-        """Raise if there has been no worker for a long time."""
+        """See to tasks that wait for workers that are gone."""
         cluster = self._cluster
-        if any(address not in cluster._refused for address in cluster._client.nthreads()):
+        alive = set(cluster._client.nthreads())
+        if alive - cluster._refused:
             self._seen = time.monotonic()
-        elif time.monotonic() - self._seen > _PATIENCE:
+        elif time.monotonic() - self._seen > PATIENCE:
             raise ClusterError(
-                f"{self.stage}: no worker with a device for {_PATIENCE:.0f} s: start some"
+                f"{self.stage}: no worker with a device for {PATIENCE:.0f} s: start some"
             )
-
-
-class _Ready:
-    """Futures as they are done, of any client."""
-
-    def __init__(self) -> None:
-        self._done: SimpleQueue[Any] = SimpleQueue()
-
-    def watch(self, future: Any) -> None:
-        """Wait for a future as well."""
-        future.add_done_callback(self._done.put)
-
-    def get(self, seconds: float) -> Any:
-        """Return the next one, or raise Empty."""
-        return self._done.get(timeout=seconds)
-
-
-def _host(address: str) -> str:
-    """Machine of an address such as tcp://10.0.0.1:4000."""
-    return address.rpartition("://")[2].rpartition(":")[0]
+        for future, number in list(self.futures.items()):
+            where = self._where[future]
+            if where is not None and not alive.intersection(where):
+                del self.futures[future]
+                future.cancel()
+                self.add(number)

@@ -130,8 +130,6 @@ def reconstruct_planes(
     if executor.folder is None:
         executor.map(_PlanesTask(work, target, threading.Lock()), parts, stage=stage)
         return
-    # A cluster of one worker loses little with several parts, and a kill costs less.
-    parts = equal_runs(shape[0], min(shape[0], PARTS * places))
     files = PlaneParts(executor.folder, shape)
     executor.map(
         _FiledPlanesTask(work, files),

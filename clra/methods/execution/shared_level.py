@@ -70,7 +70,9 @@ class SharedLevel(Level):
     def _reconstructed(self, at: At, radiographs: Radiographs, stage: str) -> VolumeParts:
         positive = self.solver.positive
         terms = self.terms if positive else 0
-        planes = slabs_of(self.cluster, self.grid, planned_volumes(terms))
+        planes = slabs_of(
+            self.cluster.places, self.cluster.slab_bytes, self.grid, planned_volumes(terms)
+        )
         options: dict[str, Any] = {
             "geometry": at.geometry,
             "valid_views": at.valid_views,
@@ -172,8 +174,19 @@ def view_chunks(places: int, views: int) -> tuple[slice, ...]:
     return tuple(equal_runs(views, min(views, count)))
 
 
-def slabs_of(cluster: DaskCluster, grid: VolumeGrid, volumes: int) -> list[slice]:
+def slabs_of(places: int, slab_bytes: int, grid: VolumeGrid, volumes: int) -> list[slice]:
     """Cut a volume into tasks: one slab a worker or more, none larger than its device takes.
+
+    Parameters
+    ----------
+    places : int
+        Workers.
+    slab_bytes : int
+        That the smallest device takes.
+    grid : VolumeGrid
+        Of the whole volume.
+    volumes : int
+        Slabs that a device holds at a time.
 
     Raises
     ------
@@ -181,11 +194,10 @@ def slabs_of(cluster: DaskCluster, grid: VolumeGrid, volumes: int) -> list[slice
         If one plane is larger than that.
     """
     nz, ny, nx = grid.shape
-    most = cluster.slab_bytes // volumes // (4 * ny * nx)
+    most = slab_bytes // volumes // (4 * ny * nx)
     if most < 1:
         raise ClusterError(
             f"one plane of {ny} x {nx} voxels is more than the workers' devices take at once, "
-            f"{cluster.slab_bytes // volumes >> 10} KiB: use a coarser grid or raise the memory "
-            "limits"
+            f"{slab_bytes // volumes >> 10} KiB: use a coarser grid or raise the memory limits"
         )
-    return equal_runs(nz, min(nz, max(cluster.places, -(-nz // most))))
+    return equal_runs(nz, min(nz, max(places, -(-nz // most))))

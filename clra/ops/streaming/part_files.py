@@ -4,8 +4,10 @@ A file appears whole or not at all. It is written under a name of its own and re
 that is done twice, because one worker seemed lost, writes the same file twice and does no harm.
 """
 
+import math
 import os
 import uuid
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -155,23 +157,26 @@ class VolumeParts:
 
 
 class _FiledVolume(Volume):
-    """A volume in files; the slab that was asked for last stays on the device."""
+    """A volume in files; as many of its slabs stay on the device as one slab may take of it."""
 
     def __init__(self, stream: Stream, parts: VolumeParts) -> None:
         self.grid = parts.grid
         self._stream, self._parts = stream, parts
         self._planes = list(parts.planes)
         self._transpose = Transpose(stream.context)
-        self._last = -1
-        self._slab: cl.array.Array | None = None
+        self._slabs: OrderedDict[int, cl.array.Array] = OrderedDict()
 
     def get(self, index: int) -> cl.array.Array:
         """Slab `index` (ny, nx, planes) on the device."""
-        if index != self._last or self._slab is None:
-            self._slab = None  # before the next takes its place
-            self._slab = self._parts.read(self._stream, index)
-            self._last = index
-        return self._slab
+        if index in self._slabs:
+            self._slabs.move_to_end(index)
+            return self._slabs[index]
+        size = 4 * math.prod(self._parts.shape(index))
+        kept = sum(slab.nbytes for slab in self._slabs.values())
+        while self._slabs and kept + size > self._stream.budgets.slab:
+            kept -= self._slabs.popitem(last=False)[1].nbytes
+        self._slabs[index] = self._parts.read(self._stream, index)
+        return self._slabs[index]
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
 from clra.errors import Cancelled, ClusterError
+from clra.methods.execution import worker_facts, worker_process
 from clra.methods.execution.dask_cluster import DaskCluster
 from clra.methods.execution.travelling import Shared, check_travels, read_task, write_task
 
@@ -217,15 +219,36 @@ def test_workers_share_the_cores(client, cluster):
         assert units == int(asked)
 
 
-def test_a_folder_that_workers_do_not_see(client, monkeypatch, tmp_path):
-    from clra.methods.execution import dask_cluster
+@pytest.mark.parametrize(
+    ("failure", "error", "expected"),
+    [
+        ("no OpenCL device", clra.DeviceError, "no worker with a device: worker tcp.*no OpenCL"),
+        ("it does not see {token}", clra.InputError, "expected a folder that all workers share"),
+    ],
+)
+def test_no_worker_can_work(client, monkeypatch, tmp_path, failure, error, expected):
+    def facts(neighbours, token):
+        return worker_facts.WorkerFacts("node", failure=failure.format(token=token))
 
-    monkeypatch.setattr(
-        dask_cluster, "facts", lambda *_: dask_cluster.WorkerFacts("node", failure=f"no {tmp_path}")
-    )
-    with pytest.raises(clra.DeviceError, match="no worker with a device"):
+    monkeypatch.setattr(worker_facts, "facts", facts)
+    with pytest.raises(error, match=expected):
         DaskCluster(client, tmp_path / "tasks")
     assert not (tmp_path / "tasks").exists()
+
+
+def test_a_worker_without_a_device_gets_no_tasks(client, monkeypatch, tmp_path):
+    def facts(neighbours, token):
+        found = worker_process.facts(neighbours, token)
+        return replace(found, failure="none") if distributed.get_worker().name == 1 else found
+
+    monkeypatch.setattr(worker_facts, "facts", facts)
+    with pytest.warns(clra.ClraWarning, match="worker tcp.*: none: the others do its work"):
+        executor = DaskCluster(client, tmp_path / "tasks")
+    try:
+        names = executor.map(lambda s, _: distributed.get_worker().name, range(4), stage="s")
+    finally:
+        executor.close()
+    assert (executor.places, set(names)) == (1, {0})
 
 
 def test_a_scan_travels_as_paths(scans, tmp_path):
