@@ -19,7 +19,7 @@ class Site:
     link : float
         Bytes a second that one worker gets of it at most.
     task_s : float
-        Time that the client and the scheduler take for a task [s]; 4 to 6 ms measured.
+        Time that the client and the scheduler take for a task [s]; 3 ms of processor time measured.
     view_s : float
         Time that the client takes for a view in an iteration: gauge and stop rule [s].
     task_bytes, view_bytes : float

@@ -55,10 +55,10 @@ class Level:
     bias: Motion | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        grid = self.region.grid
-        self.grid = grid.binned(self.factor) if self.factor > 1 else grid
         # 1, 7: down-sample the measured radiographs
         self.radiographs = self._binned()
+        grid = self.region.grid
+        self.grid = grid.binned(self.factor) if self.factor > 1 else grid
 
     def residual_motion(
         self,
