@@ -10,12 +10,18 @@ from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
-from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, finished
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
 from clra.methods.assessment.quality import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
-from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.execution.checkpoint import (
+    Checkpoint,
+    Saved,
+    cancelled,
+    checkpoint_of,
+    identity,
+)
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
@@ -226,8 +232,18 @@ def align(
                 run.align(stages, saved)
                 aligned = run.result()
                 if estimate in FREE and not cancelled(findings):
-                    rigid = RigidAlignment(stream, part, region, solver, estimate, aligned, anchor)
-                    aligned = _turned(rigid, aligned)
+                    rigid = RigidAlignment(
+                        stream,
+                        part,
+                        region,
+                        solver,
+                        estimate,
+                        aligned,
+                        anchor,
+                        keeping,
+                        run.state(),
+                    )
+                    aligned = _turned(rigid, saved)
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
@@ -240,15 +256,16 @@ def align(
     return result
 
 
-def _turned(rigid: RigidAlignment, shifts: AlignmentResult) -> AlignmentResult:
-    """Go on with a rigid motion; the shifts alone stay if the call is ended."""
+def _turned(rigid: RigidAlignment, saved: Saved | None) -> AlignmentResult:
+    """Go on with a rigid motion; what is finished stays if the call is ended."""
     try:
-        return rigid.align()
+        return rigid.align(saved)
     except Cancelled:
-        Finding("cancelled", "the alignment was ended early, with the shifts alone").warn()
-        return shifts
+        done = finished(rigid.done.history)
+        Finding("cancelled", f"the alignment was ended early, after {done}").warn()
+        return rigid.result()
     except KeyboardInterrupt:
-        raise AlignmentInterrupted(shifts) from None
+        raise AlignmentInterrupted(rigid.result()) from None
 
 
 def _judged(

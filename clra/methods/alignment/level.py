@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
-from clra.methods.alignment.reprojection import Registered, binned_mask, reproject_and_register
+from clra.methods.alignment.reprojection import Registered, reproject_and_register, used_pixels
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
@@ -103,7 +103,7 @@ class Level:
                 valid_views=valid_views,
                 circle=self.solver.circle and not self.region.truncated,
                 beside=self.region.truncated,
-                used=self.used,
+                used=used_pixels(self.scan, self.factor),
                 stage=title if doing is None else f"{title}: {doing}",
             )
 
@@ -140,10 +140,3 @@ class Level:
         if self.bias is None:
             return found
         return replace(found, motion=self.bias.inverse().then(found.motion))
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Pixels of the binned detector that count."""
-        mask = self.scan.mask
-        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
-        return binned_mask(full, self.factor)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.reprojection import binned_mask
+from clra.methods.alignment.reprojection import binned_mask, used_pixels
 from clra.methods.alignment.rigid.rigid_solution import RigidStep, solve
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.geometry import ConeBeamGeometry
@@ -102,8 +102,6 @@ class RigidLevel:
         valid_views: NDArray[np.bool_],
         title: str,
     ) -> Volume:
-        mask = self.scan.mask
-        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
         return fitted_fbp(
             self.stream,
             radiographs,
@@ -113,7 +111,7 @@ class RigidLevel:
             terms=self.solver.terms,
             valid_views=valid_views,
             circle=self.solver.circle,
-            used=binned_mask(full, self.factor),
+            used=used_pixels(self.scan, self.factor),
             stage=f"{title}: reconstructing",
         )
 
@@ -149,5 +147,4 @@ class RigidLevel:
             totals[chunk] = stream.download(out)
             del measured, simulated, over_depth, numbers, out
         stream.report(f"{title}: registering", views, views)
-        correlated = 4 * np.pi * register.low_pass**2  # pixels that count as one sample
-        return solve(totals, self.free, self.prior, register.total_weight, max(1.0, correlated))
+        return solve(totals, self.free, self.prior, register.total_weight, register.low_pass)

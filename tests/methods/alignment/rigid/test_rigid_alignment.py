@@ -108,8 +108,8 @@ def test_normal_equations_are_solved_view_by_view():
     images[:, 7] = np.einsum("nk,nkp->np", true, images[:, :7]) + 0.01 * images[:, 7]
     gram = np.einsum("nip,njp->nij", images, images)
     totals = np.stack([one[np.triu_indices(8)] for one in gram])
-    found = solve(totals, (0, 1, 2, 3, 4, 5), np.zeros(6), 400.0, 1.0)
+    found = solve(totals, (0, 1, 2, 3, 4, 5), np.zeros(6), 400.0, 0.0)
     assert np.abs(found.table - true[:, :6]).max() < 0.004
     assert np.allclose(found.sigma, 0.01 / 20, rtol=0.3)
-    held = solve(totals, (0, 1, 5), np.array([0, 0, 0, 0, 0, 1e-9]), 400.0, 1.0)
+    held = solve(totals, (0, 1, 5), np.array([0, 0, 0, 0, 0, 1e-9]), 400.0, 0.0)
     assert np.abs(held.table[:, 5]).max() < 1e-6 and np.isnan(held.sigma[:, 2:5]).all()
