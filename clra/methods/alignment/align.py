@@ -12,6 +12,7 @@ from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, finished
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
+from clra.methods.alignment.rigid.rigid_start import RigidStart
 from clra.methods.assessment.quality import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
@@ -28,6 +29,7 @@ from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
 from clra.ops.runtime.versions import versions
@@ -93,7 +95,8 @@ def align(
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.
     motion : Motion, optional
-        Where to start; by default no motion. What it has of the gauge stays.
+        Where to start; by default no motion. What it has of the gauge stays. After a rigid one the
+        result is rigid, whatever is estimated.
     truth : Motion, optional
         To report errors against; by default the scan's own, if it is a simulated one.
     progress : callable, optional
@@ -139,6 +142,8 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    if estimate == "source" and isinstance(motion, RigidMotion):
+        raise InputError("motion: found a rigid one with estimate='source', expected shifts")
     keeping, own = checkpoint_of(checkpoint, resume)
     stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
@@ -154,13 +159,15 @@ def align(
         report=progress,
     )
     anchor = gauge == "anchored" and method != "reference"
+    begun: RigidStart | None = None
 
     def told(result: AlignmentResult) -> AlignmentResult:
         """Add what is known of any run, for the whole detector."""
         offset_u, offset_v = scan.window_offset
+        found = result.motion if begun is None else begun.followed_by(result.motion)
         return replace(
             result,
-            motion=result.motion.about(-offset_u, -offset_v),
+            motion=found.about(-offset_u, -offset_v),
             warnings=tuple(findings),
             method=method,
             estimate=estimate,
@@ -182,6 +189,11 @@ def align(
         motion = None if motion is None else motion.about(*scan.window_offset)
         truth = scan.truth if truth is None else truth
         truth = None if truth is None else truth.about(*scan.window_offset)
+        own_grid = grid is None
+        grid = grid or default_grid(part.geometry)
+        if isinstance(motion, RigidMotion):
+            begun = RigidStart.of(part, motion)
+            part, motion, truth = begun.scan, None, None
         if reference is not None:
             if reference.geometry.shape == scan.geometry.shape:
                 reference = with_detector_of(scan, reference).cropped()
@@ -191,8 +203,6 @@ def align(
             motion = drift.motion
         start = motion or Motion.identity(scan.views)
         start = start.caused_by("source" if estimate == "source" else "detector")
-        own_grid = grid is None
-        grid = grid or default_grid(part.geometry)
         solver = solver or Solver()
         scale = scale and solver.estimator == "gauss-newton"
         saved = None
@@ -298,6 +308,8 @@ def _check(scan: Scan, method: str, estimate: str, gauge: str) -> None:
         raise InputError(f"method: found {method!r}, expected one of {METHODS}")
     if estimate not in ESTIMATES:
         raise InputError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
+    if estimate in FREE and method != "ra":
+        raise InputError(f"estimate: found {estimate!r} with method {method!r}, expected 'ra'")
     if gauge not in GAUGES:
         raise InputError(f"gauge: found {gauge!r}, expected one of {GAUGES}")
     if scan.views < 2:
