@@ -11,6 +11,7 @@ from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, finished
+from clra.methods.alignment.rigid.held_out_errors import with_standard_errors
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
 from clra.methods.alignment.rigid.rigid_start import RigidStart
 from clra.methods.assessment.quality import assess
@@ -284,7 +285,8 @@ def _judged(
     """Add a verdict and findings, unless the call is ended or there is not enough to judge by."""
     try:
         if aligned.valid_views.sum() >= _ENOUGH_TO_JUDGE:
-            aligned = assess(stream, scan, aligned, start, scale=scale)
+            judged = assess(stream, scan, aligned, start, scale=scale)
+            aligned = with_standard_errors(stream, scan, aligned, judged, scale=scale)
         return evidence(stream, scan, aligned)
     except (Cancelled, DeviceMemoryError):
         return aligned, []  # which is finished
