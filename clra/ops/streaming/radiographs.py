@@ -1,5 +1,7 @@
 """Radiographs of one resolution, read in chunks."""
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 from pyopencl.array import Array
@@ -11,6 +13,19 @@ from clra.ops.streaming.memory import Store, keeps
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float32]
+
+
+class KeptRadiographs(Protocol):
+    """Where radiographs are kept, such as `Store`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Views, rows, columns."""
+        ...
+
+    def read(self, start: int, stop: int) -> Floats:
+        """Return the views `start` to `stop - 1`."""
+        ...
 
 
 class Radiographs:
@@ -44,10 +59,10 @@ class Radiographs:
         self._stream, self._scan = stream, scan
         self._resident: Array | None = None
         self._uploaded: NDArray[np.bool_] | None = np.zeros(scan.views, np.bool_)
-        self._kept: Store | None = None if level == 1 else self._read_all()
+        self._kept: KeptRadiographs | None = None if level == 1 else self._read_all()
 
     @classmethod
-    def of(cls, kept: Store, level: int) -> "Radiographs":
+    def of(cls, kept: KeptRadiographs, level: int) -> "Radiographs":
         """Radiographs (views, rows, columns) of a level that are known already."""
         known = cls.__new__(cls)
         views, rows, columns = kept.shape
