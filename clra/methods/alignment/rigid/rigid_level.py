@@ -85,23 +85,24 @@ class RigidLevel:
             What progress reports begin with.
         """
         geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
-        volume = self._volume(self.radiographs, geometry, valid_views, title)
-        found = self._registered(self.radiographs, volume, geometry, title)
+        volume = self.reconstructed(self.radiographs, geometry, valid_views, title)
+        found = self.registered(self.radiographs, volume, geometry, title)
         if measure and self.bias is None and self.solver.unbias:
             doing = f"{title}, of what is simulated"
             still = reprojections(self.stream, volume, geometry, self.factor, doing)
             del volume
-            again = self._volume(still, geometry, valid_views, doing)
-            self.bias = self._registered(still, again, geometry, doing).table
+            again = self.reconstructed(still, geometry, valid_views, doing)
+            self.bias = self.registered(still, again, geometry, doing).table
         return found if self.bias is None else found.less(self.bias)
 
-    def _volume(
+    def reconstructed(
         self,
         radiographs: Radiographs,
         geometry: ConeBeamGeometry,
         valid_views: NDArray[np.bool_],
         title: str,
     ) -> Volume:
+        """Return a volume of radiographs whose geometry has absorbed the motion."""
         return fitted_fbp(
             self.stream,
             radiographs,
@@ -115,10 +116,10 @@ class RigidLevel:
             stage=f"{title}: reconstructing",
         )
 
-    def _registered(
+    def registered(
         self, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, title: str
     ) -> RigidStep:
-        """Sum up the normal equations of each view, and solve them."""
+        """Return what displaces radiographs against re-projections of a volume, view by view."""
         stream, mask = self.stream, self.scan.registration_mask
         views, rows, columns = radiographs.shape
         # The registration keeps eight images of a view twice.
