@@ -141,7 +141,7 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    measured = None if start is None else reading.start_motion(start, opened.views)
+    measured = None if start is None else reading.start_motion(start, opened)
     earlier = None if start is None or measured is not None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())

@@ -28,6 +28,7 @@ from clra.methods.alignment.steps.acceleration import MotionSteps
 from clra.methods.alignment.steps.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
+    State,
     history_from,
     history_values,
     motion_arrays,
@@ -97,6 +98,7 @@ class CoarseToFine:
     steps: MotionSteps = field(init=False)  # of the level
     rejected: NDArray[np.bool_] = field(init=False)
     rejections: Rejections = field(init=False)
+    position: tuple[int, int] = field(init=False, default=(0, 0))  # stage, iterations of it
 
     def __post_init__(self) -> None:
         excluded = () if self.scan.corrections is None else self.scan.corrections.excluded
@@ -242,22 +244,24 @@ class CoarseToFine:
             last.update_v_median,
             last.correlation,
         )
-        if self.checkpoint is None:
-            return
+        self.position = stage, done
+        if self.checkpoint is not None:
+            self.checkpoint.save(finished(self.history), *self.state())
+
+    def state(self) -> State:
+        """Return the plain values and arrays by which an interrupted alignment goes on."""
         level, update = self.last
         arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
         arrays |= {"rejected": self.rejected, "update": update}
         arrays["accepted"] = self.rejections.accepted
         values = {
-            "position": (stage, done),
+            "position": self.position,
             "history": history_values(self.history),
             "level": level,
             "fresh": self.fresh,
             "reasons": list(self.rejections.reasons.items()),
         }
-        self.checkpoint.save(
-            finished(self.history), values, arrays | registered_arrays(self.registered)
-        )
+        return values, arrays | registered_arrays(self.registered)
 
     def _go_on_from(self, saved: Saved) -> tuple[int, int]:
         """Take up a kept state; return the stage and how many of its iterations are done."""
@@ -272,7 +276,7 @@ class CoarseToFine:
         registered = registered_from(arrays)
         assert registered is not None  # by every iteration
         self.registered = registered
-        stage, done = values["position"]
+        stage, done = self.position = tuple(values["position"])
         return stage, done
 
     @property

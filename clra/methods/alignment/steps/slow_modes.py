@@ -12,6 +12,11 @@ _HALF_WAVES, _VIEWS = 16, 6
 _SLOWEST = 0.9
 
 
+def half_waves(views: int) -> int:
+    """Return how many cosines count as slow among so many views."""
+    return max(1, min(_HALF_WAVES, views // _VIEWS))
+
+
 def slow_part(values: Floats, weight: Floats) -> Floats:
     """Fit cosines of few half waves over the scan.
 
@@ -28,9 +33,8 @@ def slow_part(values: Floats, weight: Floats) -> Floats:
         The fit, at all views.
     """
     views = len(values)
-    count = max(1, min(_HALF_WAVES, views // _VIEWS))
     angle = np.pi * (np.arange(views) + 0.5) / views
-    basis = np.cos(np.multiply.outer(angle, np.arange(count)))
+    basis = np.cos(np.multiply.outer(angle, np.arange(half_waves(views))))
     root = np.sqrt(weight)
     found, *_ = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)
     return np.asarray(basis @ found)
