@@ -110,11 +110,12 @@ def align(
     """
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
-    from clra.app.exit_status import InterruptedCommandError, keeping
+    from clra.app.exit_status import InterruptedCommandError, command_line, keeping
     from clra.app.report.summary import Errors, findings_of, summary_of
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
     from clra.io.provenance import provenance
+    from clra.io.volumes.raw_volume import sidecar
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
@@ -135,7 +136,8 @@ def align(
     limits = memory.limits()
     ensure_writable(out, keep=(scan, reference))  # it may be --start: that is read by then
     kept = [scan, reference, start, out]
-    for path in (report, volume):
+    beside = sidecar(volume) if volume is not None and volume.suffix.lower() == ".raw" else None
+    for path in (report, volume, beside):
         if path is not None:
             ensure_writable(path, kept)
             kept.append(path)
@@ -148,12 +150,7 @@ def align(
     about = {
         "file": str(scan.absolute()),
         "geometry": reading.geometry(),
-        "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
-        f"--estimate {estimate} --gauge {gauge}"
-        f"{'' if reference is None else f' --reference {reference}'}"
-        f"{'' if start is None else f' --start {start}'}"
-        f"{' --autofocus' if autofocus else ''}{reading.as_typed()}"
-        f"{correcting.as_typed()}",
+        "command": command_line(),
     }
     checkpoint = Checkpoint(f"{out}.resume", resume=resume)
     with console.progress() as progress, keeping(checkpoint):
@@ -210,7 +207,7 @@ def align(
             )
             write_report(report, findings)
     values, text = summary_of(result, errors)
-    beside = {"volume": volume, "report": report}
-    written = {"file": out, **{name: path for name, path in beside.items() if path}}
+    more = {"volume": volume, "report": report}
+    written = {"file": out, **{name: path for name, path in more.items() if path}}
     names = " and ".join(str(path) for path in written.values())
     console.summary({**written, **values}, f"wrote {names}\n{text}")
