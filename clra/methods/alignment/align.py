@@ -12,7 +12,7 @@ from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
-from clra.methods.assessment.quality import assess
+from clra.methods.assessment.assess import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
