@@ -45,7 +45,7 @@ _PHOTONS = 1e3
 # are held to what is expected, and what this hides along slow modes has to show here.
 _SPREAD = 0.1
 # Columns and views of what is looked at, at most: a few seconds whatever the size of the scan.
-_COLUMNS, _VIEWS = 80, 720
+_COLUMNS, _VIEWS = 80, 480
 
 
 @dataclass(frozen=True)
