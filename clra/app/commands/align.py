@@ -8,6 +8,7 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.app.correcting import Correcting
+from clra.app.planning.cluster_option import Cluster
 from clra.errors import InputError
 
 
@@ -78,6 +79,7 @@ def align(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where this command was interrupted.")
     ] = False,
+    cluster: Cluster = None,
     report: Annotated[
         Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
     ] = None,
@@ -104,6 +106,7 @@ def align(
       clra align scan.nxs -o motion.h5 --reference quick.nxs
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
       clra align scan.nxs -o motion.h5 --autofocus
+      clra align scan.nxs -o motion.h5 --cluster tcp://node1:8786
     """
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
@@ -172,6 +175,7 @@ def align(
                 device=console.device,
                 progress=progress,
                 checkpoint=checkpoint,
+                cluster=cluster,
                 **limits,
             )
         except AlignmentInterrupted as stopped:

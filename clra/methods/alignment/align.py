@@ -16,6 +16,8 @@ from clra.methods.assessment.assess import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.execution.choice import check_for_cluster
+from clra.methods.execution.shared_level import levels_on
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
@@ -56,6 +58,7 @@ def align(
     max_host_memory: int | None = None,
     corrections: CorrectionOptions | None = None,
     quality: bool = True,
+    cluster: Any = None,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -111,6 +114,10 @@ def align(
     quality : bool
         Whether to judge the result by views that are held out: a verdict, and standard errors that
         count what is left. A motion that predicts them no better than the start is not returned.
+    cluster : distributed.Client or str, optional
+        Workers that reconstruct, project and register for "ra", but for `estimate` "rigid" and
+        those with a roll: a client of Dask, or "local:N", "slurm:N", the address of a scheduler or
+        its file. The scan has to be in a file. What is left for the device here is small.
 
     Returns
     -------
@@ -133,6 +140,8 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    check_for_cluster(cluster, scan, method, ("ra",))
+    check_for_cluster(cluster, scan, estimate, [e for e in ESTIMATES if e not in FREE])
     keeping, own = checkpoint_of(checkpoint, resume)
     stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
@@ -223,7 +232,12 @@ def align(
                     truth,
                     keeping,
                 )
-                run.align(stages, saved)
+                limits = {
+                    "max_device_memory": max_device_memory,
+                    "max_host_memory": max_host_memory,
+                }
+                with levels_on(cluster, part, keeping, progress, limits) as run.make_level:
+                    run.align(stages, saved)
                 aligned = run.result()
                 if estimate in FREE and not cancelled(findings):
                     rigid = RigidAlignment(stream, part, region, solver, estimate, aligned, anchor)

@@ -9,7 +9,7 @@ is left.
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -72,6 +72,8 @@ class CoarseToFine:
         To report errors against.
     checkpoint : Checkpoint, optional
         Keeps each finished iteration.
+    make_level : callable
+        Makes a :class:`Level` of its first five arguments.
     """
 
     stream: Stream
@@ -84,6 +86,7 @@ class CoarseToFine:
     start: Motion
     truth: Motion | None = None
     checkpoint: Checkpoint | None = None
+    make_level: Callable[[Stream, Scan, Region, Solver, int], Level] = Level
     several: bool = field(init=False)  # iterations in the schedule
     motion: Motion = field(init=False)
     history: list[Iteration] = field(init=False, default_factory=list)
@@ -128,7 +131,7 @@ class CoarseToFine:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        level = Level(self.stream, self.scan, self.region, self.solver, stage.level)
+        level = self.make_level(self.stream, self.scan, self.region, self.solver, stage.level)
         if not self.history:
             self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
