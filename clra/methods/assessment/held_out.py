@@ -37,8 +37,10 @@ Floats = NDArray[np.float64]
 
 # Updates of the volume, all subsets of all passes.
 _UPDATES = 9
-# Parts of the views, each predicted from the others: of few views a half is too few to go by.
-_FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
+FEW = 60
+"""Number of views below which a half of them is too few to go by."""
+# Parts of the views, each predicted from the others.
+_PARTS, _PARTS_OF_FEW = 2, 4
 # Photons that weigh the rays against each other: nearly alike.
 _PHOTONS = 1e3
 # Expected spread of log(magnification), so wide that it pulls nothing: alignments of small images
@@ -150,7 +152,7 @@ class HeldOut:
         geometry = geometry.binned(level)
         binned = Scan(radiographs, geometry)
         index = np.arange(len(views))
-        times = _PARTS_OF_FEW if len(views) < _FEW else _PARTS
+        times = _PARTS_OF_FEW if len(views) < FEW else _PARTS
         residual = np.full(self.scan.views, np.nan)
         shift = np.full((self.scan.views, 3), np.nan)
         parts = np.full((self.scan.views, PARTS, PARTS), np.nan)
