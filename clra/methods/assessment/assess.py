@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 # Mean absolute error over root mean square, of normal errors.
 _MEAN = 0.8
-# Part of the distance to their predictions at which views are closer to them than at the start: of 9
+# Part of the distance to their predictions at which views lie closer than at the start: of 9
 # views that did not move 0.77 to 1.3 is left by chance, of 9 that moved by half a pixel 0.4.
 _CLOSER, _CLOSER_OF_FEW = 0.9, 0.6
 # Points of the sample by which the gauge is known.
