@@ -1,0 +1,197 @@
+"""Pre-alignment: large motions, and the slow modes that an arc of a parallel beam leaves open.
+
+Re-projection alignment needs a first volume that resembles the sample, and on an arc its slow modes
+end where filtered back-projection errs least rather than at the truth. Sums over the radiographs
+tell both without a volume. They are not exact in a cone beam, to half a pixel at a half fan of 9
+degrees: there they are where the iteration starts, and only if the motion is large.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clra.methods.alignment.prealignment.mass_centres import CentreShifts, centre_shifts
+from clra.methods.alignment.prealignment.projection_sums import (
+    ProjectionSums,
+    projection_sums,
+)
+from clra.methods.alignment.prealignment.row_profiles import ProfileShifts, profile_shifts
+from clra.methods.alignment.steps.slow_modes import slow_part
+from clra.model.gauge.gauge import Gauge
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.motion import Motion
+from clra.model.sampling.angular_coverage import covered, fan_angle
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+
+Floats = NDArray[np.float64]
+
+# Angle that the detector spans from the source below which a beam counts as parallel [rad].
+_PARALLEL = math.radians(0.1)
+# Root mean square of the shifts, in heights or widths of the detector, from which on the motion is
+# large. Circles align by themselves up to twice that, helices do not. And the part of the rows'
+# sums' squared mismatch that may be left.
+_LARGE, _UNEXPLAINED = 0.08, 0.25
+# Root mean square of the slow modes' error, by halves of the sample, up to which they count as
+# known [pixel]; and what is lost of the mass, times the sample's half width [pixel].
+_KNOWN, _LOST = 0.03, 0.1
+# Most columns of radiographs whose sums are to be exact.
+_COLUMNS = 512
+# Rows per height of the axis may differ by this part, and columns of its image by this part of the
+# rows.
+_UPRIGHT = 0.01
+
+
+@dataclass(frozen=True)
+class Prealignment:
+    """Shifts that sums over the radiographs tell.
+
+    Attributes
+    ----------
+    motion : Motion
+        In pixels of the full-resolution detector.
+    known : ndarray of bool, (3, views)
+        Views whose slow modes in u, v and magnification are told better than by re-projections.
+    correlation : float
+        Part of the mismatch of the rows' sums that is explained.
+    residual : float
+        Root mean square of what is left of them, for a pixel [attenuation].
+    """
+
+    motion: Motion
+    known: NDArray[np.bool_]
+    correlation: float
+    residual: float
+
+    def held(self, motion: Motion, valid_views: NDArray[np.bool_], *, scale: bool) -> Motion:
+        """Return a motion with the slow modes that are known, magnification's among them or not."""
+        columns = [
+            found - slow_part(found - told, known.astype(float)) if known.any() else found
+            for found, told, known in zip(
+                _lengths(motion), _lengths(self.motion), self.known & valid_views, strict=True
+            )
+        ]
+        return Motion(
+            shift_u=columns[0],
+            shift_v=columns[1],
+            magnification=np.exp(columns[2]) if scale else motion.magnification,
+            cause=motion.cause,
+        ).normalised()
+
+
+def _lengths(motion: Motion) -> tuple[Floats, Floats, Floats]:
+    return motion.shift_u, motion.shift_v, np.log(motion.magnification)
+
+
+def level_of_sums(geometry: ConeBeamGeometry, *, exact: bool, coarsest: int) -> int:
+    """Binning of radiographs to sum: a coarse one will do but where sums are exact."""
+    level = 1
+    while level < coarsest and (not exact or geometry.columns > _COLUMNS * level):
+        level *= 2
+    return level
+
+
+def tells_slow_modes(geometry: ConeBeamGeometry) -> bool:
+    """Whether sums over the radiographs are exact, and re-projections have slow modes at all."""
+    tall = geometry.rows / geometry.columns
+    angle = fan_angle(geometry) * max(1.0, tall)
+    return angle < _PARALLEL and covered(geometry) < 2 * math.pi
+
+
+def prealigned(
+    stream: Stream,
+    radiographs: Radiographs,
+    geometry: ConeBeamGeometry,
+    valid_views: NDArray[np.bool_],
+    gauge: Gauge,
+) -> Prealignment | None:
+    """Find shifts by sums over the radiographs, where they are of use.
+
+    Parameters
+    ----------
+    stream : Stream
+        Memory budget, and whom to tell how far it is.
+    radiographs : Radiographs
+        At any resolution; all are read twice.
+    geometry : ConeBeamGeometry
+        Of the scan, at full resolution, as it should have been.
+    valid_views : ndarray of bool, (views,)
+        Views to rely on; others get what lies between their neighbours'.
+    gauge : Gauge
+        What is taken out of the shifts.
+
+    Returns
+    -------
+    Prealignment or None
+        None if the sample is cut off by the detector's left or right border in half of the views
+        or more, the axis is not along the detector's rows' direction, or the motion is neither
+        large nor on an arc of a parallel beam.
+    """
+    axis = _axis(geometry.binned(radiographs.level))
+    if axis is None or valid_views.sum() < 2:
+        return None
+    sums = projection_sums(stream, radiographs, valid_views)
+    if sums is None:
+        return None
+    sums = sums.of(valid_views)
+    column, row, slope = (values[valid_views] for values in axis)
+    along_v = profile_shifts(sums.mass, row, sums.whole)
+    unexplained = along_v.after**2 / max(along_v.before**2, np.finfo(float).tiny)
+    if unexplained > _UNEXPLAINED:
+        return None
+    direction = geometry.source[valid_views, :2]
+    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    source = np.column_stack([direction, row / radiographs.shape[1]])
+    along_u = centre_shifts(sums, column, slope, row + along_v.shift, source)
+    if along_u is None:
+        return None
+    views, good = np.arange(geometry.views), np.flatnonzero(valid_views)
+    shift_u, shift_v = (
+        radiographs.level * np.interp(views, good, shift)
+        for shift in (along_u.shift, along_v.shift)
+    )
+    motion = gauge.anchored(Motion(shift_u=shift_u, shift_v=shift_v))
+    known = np.zeros((3, geometry.views), np.bool_)
+    if tells_slow_modes(geometry):
+        exact = _exact(along_u, along_v, sums, radiographs.level)
+        known[:, good] = exact[:, None] & sums.whole
+        stretch = np.interp(views, good, along_v.stretch)
+        motion = replace(motion, magnification=1 + stretch)
+    sides = zip((motion.shift_u, motion.shift_v), reversed(geometry.shape), strict=True)
+    moved = max(float(np.std(shift)) / size for shift, size in sides)
+    if moved < _LARGE and not known.any():
+        return None
+    residual = along_v.after / (2 * sums.half_width + 1)
+    return Prealignment(motion, known, 1 - unexplained, residual)
+
+
+def _axis(geometry: ConeBeamGeometry) -> tuple[Floats, Floats, Floats] | None:
+    """Column of the axis, row of its origin and slope of the column along x and y; if upright."""
+    matrices = geometry.projection_matrices()
+    origin, depth = matrices[:, :, 3], matrices[:, 2, 3]
+    column, row = origin[:, 0] / depth, origin[:, 1] / depth
+    slope = matrices[:, 0, :] - column[:, None] * matrices[:, 2, :]
+    rising = (matrices[:, 1, 2] - row * matrices[:, 2, 2]) / depth
+    slope = slope / depth[:, None]
+    rate = float(np.median(np.abs(rising)))
+    uneven = np.abs(np.abs(rising) - rate).max() > _UPRIGHT * rate
+    if uneven or np.ptp(np.sign(rising)) > 0 or np.abs(slope[:, 2]).max() > _UPRIGHT * rate:
+        return None
+    return column, row, slope[:, :2]
+
+
+def _exact(
+    along_u: CentreShifts, along_v: ProfileShifts, sums: ProjectionSums, level: int
+) -> NDArray[np.bool_]:
+    """Whether slow modes in u, v and m are known, by what halves of the sample make of them."""
+    weight = sums.whole.astype(float)
+
+    def slow(values: Floats) -> float:
+        return float(np.sqrt(np.average(slow_part(values, weight) ** 2, weights=weight)))
+
+    wrong_u, wrong_v = (0.5 * level * slow(along.difference) for along in (along_u, along_v))
+    lost = level * sums.half_width * slow(along_u.loss)
+    known_v = wrong_v < _KNOWN
+    return np.array([wrong_u < _KNOWN and lost < _LOST, known_v, known_v])
