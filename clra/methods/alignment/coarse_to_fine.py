@@ -22,9 +22,8 @@ from clra.methods.alignment.limits import false_shifts, far_motion, lost_feature
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.prealignment.prealignment import (
     Prealignment,
-    level_of_sums,
+    is_open,
     prealigned,
-    tells_slow_modes,
 )
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import Rejections
@@ -53,7 +52,6 @@ from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import Stage, converged, level_name, update_size
-from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -126,7 +124,7 @@ class CoarseToFine:
         self.several = sum(stage.limit for stage in stages) > 1
         first, done = (0, 0) if saved is None else self._go_on_from(saved)
         try:
-            if saved is None and self._prealigns:
+            if saved is None and self.solver.prealign and is_open(self.schedule, self.start):
                 self._prealign(stages[0].level)
             for index, stage in enumerate(stages):
                 begun = done if index == first else 0
@@ -142,41 +140,23 @@ class CoarseToFine:
             message = f"the alignment was ended early, after {finished(self.history)}"
             Finding("cancelled", message).warn()
 
-    @property
-    def _prealigns(self) -> bool:
-        """Whether nothing is known of the motion, and the way to find it is left to us."""
-        still = all((column == column[0]).all() for column in self.start.columns())
-        wanted = self.solver.prealign and self.schedule == "auto"
-        return wanted and still and self.start.cause == "detector"
-
     def _prealign(self, coarsest: int) -> None:
         """Begin with what sums over the radiographs tell, if it is of use."""
         started = time.perf_counter()
-        exact = tells_slow_modes(self.scan.geometry)
-        level = level_of_sums(self.scan.geometry, exact=exact, coarsest=coarsest)
-        radiographs = Radiographs(self.stream, self.scan, level)
-        valid = ~self.rejections.first(self.stream, radiographs)
-        found = prealigned(self.stream, radiographs, self.scan.geometry, valid, self.shift_gauge)
+        found = prealigned(self.stream, self.scan, coarsest, self.rejections, self.shift_gauge)
         if found is None:
             return
-        self.prealigned = found
-        # Its magnifications are right on average, not in each view.
-        self.motion = replace(found.motion, magnification=self.start.magnification)
-        update = np.stack([found.motion.shift_u, found.motion.shift_v])
-        self.history.append(
-            Iteration.of(
-                PREALIGNED,
-                1,
-                update,
-                np.array([found.correlation]),
-                np.array([found.residual]),
-                time.perf_counter() - started,
-                **self._errors(),
-            )
-        )
+        self._begin_with(found)
+        seconds = time.perf_counter() - started
+        self.history.append(found.entry(seconds, **self._errors()))
         if self.checkpoint is not None:
             values = {"position": (0, 0), "history": history_values(self.history)}
             self.checkpoint.save(finished(self.history), values, prealigned_arrays(found))
+
+    def _begin_with(self, found: Prealignment) -> None:
+        """Take shifts from a pre-alignment; magnifications are right on average, not in a view."""
+        self.prealigned, self.rejections.vouched = found, found.vouched
+        self.motion = replace(found.motion, magnification=self.start.magnification)
 
     def align_level(self, stage: Stage, index: int = 0, done: int = 0) -> None:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
@@ -316,13 +296,13 @@ class CoarseToFine:
     def _go_on_from(self, saved: Saved) -> tuple[int, int]:
         """Take up a kept state; return the stage and how many of its iterations are done."""
         arrays, values, cause = saved.arrays, saved.values, self.start.cause
-        self.prealigned = prealigned_from(arrays)
+        before = prealigned_from(arrays)
+        if before is not None:
+            self._begin_with(before)
         self.history = history_from(values["history"])
         stage, done = values["position"]
         self.registered = registered_from(arrays)
         if self.registered is None:
-            assert self.prealigned is not None  # else nothing was kept
-            self.motion = replace(self.prealigned.motion, magnification=self.start.magnification)
             return stage, done
         self.motion = motion_from(arrays, "motion", cause)
         self.found = motion_from(arrays, "found", cause)

@@ -8,6 +8,7 @@ degrees: there they are where the iteration starts, and only if the motion is la
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,14 @@ from clra.methods.alignment.prealignment.projection_sums import (
     projection_sums,
 )
 from clra.methods.alignment.prealignment.row_profiles import ProfileShifts, profile_shifts
+from clra.methods.alignment.rejected_views import Rejections
+from clra.methods.alignment.result import PREALIGNED, Iteration
 from clra.methods.alignment.steps.slow_modes import slow_part
 from clra.model.gauge.gauge import Gauge
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered, fan_angle
+from clra.model.scan import Scan
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
@@ -37,6 +41,9 @@ _LARGE, _UNEXPLAINED = 0.08, 0.25
 # Root mean square of the slow modes' error, by halves of the sample, up to which they count as
 # known [pixel]; and what is lost of the mass, times the sample's half width [pixel].
 _KNOWN, _LOST = 0.03, 0.1
+# Where they are known, a shift that is registered this far aside is wrong [pixel]: single ones err
+# by 0.02. And by how much the slow modes are damped: a few views in a row may well be unknown.
+_ASIDE, _DAMPING = 0.5, 0.01
 # Most columns of radiographs whose sums are to be exact.
 _COLUMNS = 512
 # Rows per height of the axis may differ by this part, and columns of its image by this part of the
@@ -65,14 +72,46 @@ class Prealignment:
     correlation: float
     residual: float
 
+    @property
+    def vouched(self) -> NDArray[np.bool_]:
+        """Views whose mass and profile are those of the others: they show this sample."""
+        return np.asarray(self.known[:2].all(axis=0))
+
+    def entry(self, seconds: float, **errors: Any) -> Iteration:
+        """Return it as it appears in a history."""
+        shifts = np.stack([self.motion.shift_u, self.motion.shift_v])
+        quality = np.array([self.correlation]), np.array([self.residual])
+        return Iteration.of(PREALIGNED, 1, shifts, *quality, seconds, **errors)
+
     def held(self, motion: Motion, valid_views: NDArray[np.bool_], *, scale: bool) -> Motion:
-        """Return a motion with the slow modes that are known, magnification's among them or not."""
-        columns = [
-            found - slow_part(found - told, known.astype(float)) if known.any() else found
-            for found, told, known in zip(
-                _lengths(motion), _lengths(self.motion), self.known & valid_views, strict=True
-            )
-        ]
+        """Return a motion that goes on from this one.
+
+        Parameters
+        ----------
+        motion : Motion
+            By registration.
+        valid_views : ndarray of bool, (views,)
+            Others are aside of the pre-alignment by what lies between their neighbours.
+        scale : bool
+            Whether magnifications are estimated.
+
+        Returns
+        -------
+        Motion
+            Its slow modes are those that are known, and no shift that is known is far from it.
+        """
+        columns, views = [], np.arange(motion.views)
+        for axis, (found, told) in enumerate(
+            zip(_lengths(motion), _lengths(self.motion), strict=True)
+        ):
+            known, beside = self.known[axis], found - told
+            if axis < 2 and valid_views.any():
+                beside = np.interp(views, views[valid_views], beside[valid_views])
+            if known.any():
+                beside = beside - slow_part(beside, known.astype(float), _DAMPING)
+                if axis < 2:
+                    beside[known & (np.abs(beside) > _ASIDE)] = 0.0
+            columns.append(told + beside)
         return Motion(
             shift_u=columns[0],
             shift_v=columns[1],
@@ -85,27 +124,14 @@ def _lengths(motion: Motion) -> tuple[Floats, Floats, Floats]:
     return motion.shift_u, motion.shift_v, np.log(motion.magnification)
 
 
-def level_of_sums(geometry: ConeBeamGeometry, *, exact: bool, coarsest: int) -> int:
-    """Binning of radiographs to sum: a coarse one will do but where sums are exact."""
-    level = 1
-    while level < coarsest and (not exact or geometry.columns > _COLUMNS * level):
-        level *= 2
-    return level
-
-
-def tells_slow_modes(geometry: ConeBeamGeometry) -> bool:
-    """Whether sums over the radiographs are exact, and re-projections have slow modes at all."""
-    tall = geometry.rows / geometry.columns
-    angle = fan_angle(geometry) * max(1.0, tall)
-    return angle < _PARALLEL and covered(geometry) < 2 * math.pi
+def is_open(schedule: str, start: Motion) -> bool:
+    """Whether nothing is known of the motion, and the way to find it is left to us."""
+    still = all((column == column[0]).all() for column in start.columns())
+    return schedule == "auto" and still and start.cause == "detector"
 
 
 def prealigned(
-    stream: Stream,
-    radiographs: Radiographs,
-    geometry: ConeBeamGeometry,
-    valid_views: NDArray[np.bool_],
-    gauge: Gauge,
+    stream: Stream, scan: Scan, coarsest: int, rejections: Rejections, gauge: Gauge
 ) -> Prealignment | None:
     """Find shifts by sums over the radiographs, where they are of use.
 
@@ -113,12 +139,12 @@ def prealigned(
     ----------
     stream : Stream
         Memory budget, and whom to tell how far it is.
-    radiographs : Radiographs
-        At any resolution; all are read twice.
-    geometry : ConeBeamGeometry
-        Of the scan, at full resolution, as it should have been.
-    valid_views : ndarray of bool, (views,)
-        Views to rely on; others get what lies between their neighbours'.
+    scan : Scan
+        All its radiographs are read.
+    coarsest : int
+        Binning of the first iteration.
+    rejections : Rejections
+        What rejects views: they get what lies between their neighbours'.
     gauge : Gauge
         What is taken out of the shifts.
 
@@ -126,9 +152,12 @@ def prealigned(
     -------
     Prealignment or None
         None if the sample is cut off by the detector's left or right border in half of the views
-        or more, the axis is not along the detector's rows' direction, or the motion is neither
-        large nor on an arc of a parallel beam.
+        or more, the detector's columns are not along the axis, or the motion is neither large nor
+        on an arc of a parallel beam.
     """
+    geometry = scan.geometry
+    radiographs = Radiographs(stream, scan, _level(geometry, coarsest))
+    valid_views = ~rejections.first(stream, radiographs)
     axis = _axis(geometry.binned(radiographs.level))
     if axis is None or valid_views.sum() < 2:
         return None
@@ -165,6 +194,20 @@ def prealigned(
         return None
     residual = along_v.after / (2 * sums.half_width + 1)
     return Prealignment(motion, known, 1 - unexplained, residual)
+
+
+def tells_slow_modes(geometry: ConeBeamGeometry) -> bool:
+    """Whether sums over the radiographs are exact, and re-projections have slow modes at all."""
+    angle = fan_angle(geometry) * max(1.0, geometry.rows / geometry.columns)
+    return angle < _PARALLEL and covered(geometry) < 2 * math.pi
+
+
+def _level(geometry: ConeBeamGeometry, coarsest: int) -> int:
+    """Binning of radiographs to sum: the coarsest will do but where sums are exact."""
+    level, exact = 1, tells_slow_modes(geometry)
+    while level < coarsest and (not exact or geometry.columns > _COLUMNS * level):
+        level *= 2
+    return level
 
 
 def _axis(geometry: ConeBeamGeometry) -> tuple[Floats, Floats, Floats] | None:
