@@ -61,7 +61,8 @@ def prealigned_arrays(found: Prealignment | None) -> dict[str, NDArray[Any]]:
     if found is None:
         return {}
     quality = np.array([found.correlation, found.residual])
-    arrays = {"prealigned_known": found.known, "prealigned_quality": quality}
+    arrays = {"prealigned_known": found.known, "prealigned_exact": found.exact}
+    arrays |= {"prealigned_quality": quality}
     return motion_arrays("prealigned", found.motion) | arrays
 
 
@@ -71,4 +72,5 @@ def prealigned_from(arrays: Arrays) -> Prealignment | None:
         return None
     correlation, residual = arrays["prealigned_quality"].tolist()
     motion = motion_from(arrays, "prealigned", "detector")
-    return Prealignment(motion, arrays["prealigned_known"], correlation, residual)
+    known, exact = arrays["prealigned_known"], arrays["prealigned_exact"]
+    return Prealignment(motion, known, exact, correlation, residual)

@@ -65,7 +65,8 @@ def centre_shifts(
     if layers is None:
         return None
     mass, moment, seen = layers
-    mean = np.where(seen, mass, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    whole = seen & sums.whole[:, None]
+    mean = np.where(whole, mass, 0).sum(axis=0) / np.maximum(whole.sum(axis=0), 1)
     used = seen & (mean > _LEAST * mean.max()) & (mass > 0.5 * mean)
     # Of the variance of a centre: that of the pixels' noise over the mass squared.
     weight = np.where(used, mean**2, 0.0)

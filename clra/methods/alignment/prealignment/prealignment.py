@@ -38,9 +38,12 @@ _PARALLEL = math.radians(0.1)
 # large. Circles align by themselves up to twice that, helices do not. And the part of the rows'
 # sums' squared mismatch that may be left.
 _LARGE, _UNEXPLAINED = 0.08, 0.25
-# Root mean square of the slow modes' error, by halves of the sample, up to which they count as
-# known [pixel]; and what is lost of the mass, times the sample's half width [pixel].
+# Root mean square of an error, by halves of the sample, up to which slow modes or each view's shift
+# count as known [pixel]; and what is lost of the mass, times the sample's half width [pixel].
 _KNOWN, _LOST = 0.03, 0.1
+# Robust standard deviations by which a view's mass may differ from the others', and what may differ
+# in any case, a part of it.
+_OUTLYING, _SLIGHT = 5.0, 1e-3
 # Where they are known, a shift that is registered this far aside is wrong [pixel]: single ones err
 # by 0.02. And by how much the slow modes are damped: a few views in a row may well be unknown.
 _ASIDE, _DAMPING = 0.5, 0.01
@@ -61,6 +64,8 @@ class Prealignment:
         In pixels of the full-resolution detector.
     known : ndarray of bool, (3, views)
         Views whose slow modes in u, v and magnification are told better than by re-projections.
+    exact : ndarray of bool, (2,)
+        Whether all of u and v is, in these views.
     correlation : float
         Part of the mismatch of the rows' sums that is explained.
     residual : float
@@ -69,6 +74,7 @@ class Prealignment:
 
     motion: Motion
     known: NDArray[np.bool_]
+    exact: NDArray[np.bool_]
     correlation: float
     residual: float
 
@@ -98,7 +104,7 @@ class Prealignment:
         Returns
         -------
         Motion
-            Its slow modes are those that are known, and no shift that is known is far from it.
+            With all that is known: its shifts, or their slow modes.
         """
         columns, views = [], np.arange(motion.views)
         for axis, (found, told) in enumerate(
@@ -110,7 +116,7 @@ class Prealignment:
             if known.any():
                 beside = beside - slow_part(beside, known.astype(float), _DAMPING)
                 if axis < 2:
-                    beside[known & (np.abs(beside) > _ASIDE)] = 0.0
+                    beside[known & (self.exact[axis] | (np.abs(beside) > _ASIDE))] = 0.0
             columns.append(told + beside)
         return Motion(
             shift_u=columns[0],
@@ -166,15 +172,20 @@ def prealigned(
         return None
     sums = sums.of(valid_views)
     column, row, slope = (values[valid_views] for values in axis)
-    along_v = profile_shifts(sums.mass, row, sums.whole)
-    unexplained = along_v.after**2 / max(along_v.before**2, np.finfo(float).tiny)
-    if unexplained > _UNEXPLAINED:
-        return None
+    axis = column, row, slope
     direction = geometry.source[valid_views, :2]
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     source = np.column_stack([direction, row / radiographs.shape[1]])
-    along_u = centre_shifts(sums, column, slope, row + along_v.shift, source)
-    if along_u is None:
+    found = _matched(sums, axis, source)
+    if found is not None:
+        # A view that lacks a little of the sample was taken for whole.
+        sums = replace(sums, whole=sums.whole & ~_far(found[0].loss, sums.whole))
+        found = _matched(sums, axis, source)
+    if found is None:
+        return None
+    along_u, along_v = found
+    unexplained = along_v.after**2 / max(along_v.before**2, np.finfo(float).tiny)
+    if unexplained > _UNEXPLAINED:
         return None
     views, good = np.arange(geometry.views), np.flatnonzero(valid_views)
     shift_u, shift_v = (
@@ -182,10 +193,10 @@ def prealigned(
         for shift in (along_u.shift, along_v.shift)
     )
     motion = gauge.anchored(Motion(shift_u=shift_u, shift_v=shift_v))
-    known = np.zeros((3, geometry.views), np.bool_)
+    known, exact = np.zeros((3, geometry.views), np.bool_), np.zeros(2, np.bool_)
     if tells_slow_modes(geometry):
-        exact = _exact(along_u, along_v, sums, radiographs.level)
-        known[:, good] = exact[:, None] & sums.whole
+        told, exact = _accuracy(along_u, along_v, sums, radiographs.level)
+        known[:, good] = told[[0, 1, 1], None] & sums.whole
         stretch = np.interp(views, good, along_v.stretch)
         motion = replace(motion, magnification=1 + stretch)
     sides = zip((motion.shift_u, motion.shift_v), reversed(geometry.shape), strict=True)
@@ -193,7 +204,7 @@ def prealigned(
     if moved < _LARGE and not known.any():
         return None
     residual = along_v.after / (2 * sums.half_width + 1)
-    return Prealignment(motion, known, 1 - unexplained, residual)
+    return Prealignment(motion, known, exact, 1 - unexplained, residual)
 
 
 def tells_slow_modes(geometry: ConeBeamGeometry) -> bool:
@@ -225,16 +236,40 @@ def _axis(geometry: ConeBeamGeometry) -> tuple[Floats, Floats, Floats] | None:
     return column, row, slope[:, :2]
 
 
-def _exact(
+def _matched(
+    sums: ProjectionSums, axis: tuple[Floats, Floats, Floats], source: Floats
+) -> tuple[CentreShifts, ProfileShifts] | None:
+    """Shifts along u and v, if there is a view to tell them."""
+    if not sums.whole.any():
+        return None
+    column, row, slope = axis
+    along_v = profile_shifts(sums.mass, row, sums.whole)
+    along_u = centre_shifts(sums, column, slope, row + along_v.shift, source)
+    return None if along_u is None else (along_u, along_v)
+
+
+def _far(loss: Floats, whole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether more of the mass is lost, or won, than in most views that are whole."""
+    beside = np.abs(loss - np.median(loss[whole]))
+    return np.asarray(beside > max(_OUTLYING * 1.4826 * float(np.median(beside[whole])), _SLIGHT))
+
+
+def _accuracy(
     along_u: CentreShifts, along_v: ProfileShifts, sums: ProjectionSums, level: int
-) -> NDArray[np.bool_]:
-    """Whether slow modes in u, v and m are known, by what halves of the sample make of them."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether slow modes, and each view's shift, are known in u and v.
+
+    Halves of the sample tell by how far they disagree.
+    """
     weight = sums.whole.astype(float)
 
-    def slow(values: Floats) -> float:
-        return float(np.sqrt(np.average(slow_part(values, weight) ** 2, weights=weight)))
+    def size(values: Floats) -> float:
+        return level * float(np.sqrt(np.average(values**2, weights=weight)))
 
-    wrong_u, wrong_v = (0.5 * level * slow(along.difference) for along in (along_u, along_v))
-    lost = level * sums.half_width * slow(along_u.loss)
-    known_v = wrong_v < _KNOWN
-    return np.array([wrong_u < _KNOWN and lost < _LOST, known_v, known_v])
+    differences = [along.difference for along in (along_u, along_v)]
+    slow = np.array([0.5 * size(slow_part(values, weight)) for values in differences])
+    each = np.array([0.5 * size(values) for values in differences])
+    lost = sums.half_width * size(slow_part(along_u.loss, weight))
+    right = np.array([lost < _LOST and level * sums.aside < _KNOWN, True])
+    known = right & (slow < _KNOWN)
+    return known, known & (each < _KNOWN)

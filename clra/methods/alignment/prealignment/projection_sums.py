@@ -1,6 +1,6 @@
 """Sums over the rows of each radiograph, within a window that follows the sample."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,8 @@ class ProjectionSums:
         Of the sample, about its centre of mass, as far as any view shows it.
     whole : ndarray of bool, (views,)
         Whether the sample lies between the detector's left and right border.
+    tilt : float
+        By how much the air at the right border is above that at the left, for a column.
     """
 
     profiles: Floats
@@ -45,12 +47,27 @@ class ProjectionSums:
     centre: Floats
     half_width: float
     whole: NDArray[np.bool_]
+    tilt: float
+
+    @property
+    def aside(self) -> float:
+        """How far the tilt moves the centre of mass of a view [pixel]."""
+        rows = self.mass.shape[1]
+        moment = 2 / 3 * self.half_width**3 * rows * self.tilt
+        return float(abs(moment) / np.median(self.mass[self.whole].sum(axis=1)))
 
     def of(self, views: NDArray[np.bool_]) -> "ProjectionSums":
         """Return the sums of some views."""
         arrays = (self.profiles, self.mass, self.moment, self.centre)
         profiles, mass, moment, centre = (values[views] for values in arrays)
-        return ProjectionSums(profiles, mass, moment, centre, self.half_width, self.whole[views])
+        return replace(
+            self,
+            profiles=profiles,
+            mass=mass,
+            moment=moment,
+            centre=centre,
+            whole=self.whole[views],
+        )
 
 
 def projection_sums(
@@ -77,7 +94,8 @@ def projection_sums(
     for chunk in stream.chunks(views, radiographs.view_bytes):
         stream.report("pre-alignment: reading", chunk.start, views)
         profiles[chunk] = radiographs.read(chunk).mean(axis=1, dtype=np.float64)
-    at_border = np.maximum(profiles[:, :_BORDER].mean(axis=1), profiles[:, -_BORDER:].mean(axis=1))
+    left, right = profiles[:, :_BORDER].mean(axis=1), profiles[:, -_BORDER:].mean(axis=1)
+    at_border = np.maximum(left, right)
     level = float(np.median(profiles[valid_views].max(axis=1)))
     inside = valid_views & (at_border < AT_BORDER * level)
     if level <= 0 or 2 * inside.sum() <= valid_views.sum():
@@ -96,7 +114,8 @@ def projection_sums(
     whole = inside & within
     if 2 * whole.sum() <= valid_views.sum():
         return None
-    return ProjectionSums(profiles, mass, moment, centre, half_width, whole)
+    tilt = float(np.median((right - left)[whole])) / columns
+    return ProjectionSums(profiles, mass, moment, centre, half_width, whole, tilt)
 
 
 def _window(profiles: Floats, inside: NDArray[np.bool_]) -> tuple[Floats, float]:
