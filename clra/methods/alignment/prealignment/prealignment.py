@@ -270,6 +270,6 @@ def _accuracy(
     slow = np.array([0.5 * size(slow_part(values, weight)) for values in differences])
     each = np.array([0.5 * size(values) for values in differences])
     lost = sums.half_width * size(slow_part(along_u.loss, weight))
-    right = np.array([lost < _LOST and level * sums.aside < _KNOWN, True])
-    known = right & (slow < _KNOWN)
+    complete = np.array([lost < _LOST, True])
+    known = complete & (slow < _KNOWN)
     return known, known & (each < _KNOWN)

@@ -37,8 +37,6 @@ class ProjectionSums:
         Of the sample, about its centre of mass, as far as any view shows it.
     whole : ndarray of bool, (views,)
         Whether the sample lies between the detector's left and right border.
-    tilt : float
-        By how much the air at the right border is above that at the left, for a column.
     """
 
     profiles: Floats
@@ -47,14 +45,6 @@ class ProjectionSums:
     centre: Floats
     half_width: float
     whole: NDArray[np.bool_]
-    tilt: float
-
-    @property
-    def aside(self) -> float:
-        """How far the tilt moves the centre of mass of a view [pixel]."""
-        rows = self.mass.shape[1]
-        moment = 2 / 3 * self.half_width**3 * rows * self.tilt
-        return float(abs(moment) / np.median(self.mass[self.whole].sum(axis=1)))
 
     def of(self, views: NDArray[np.bool_]) -> "ProjectionSums":
         """Return the sums of some views."""
@@ -100,6 +90,10 @@ def projection_sums(
     inside = valid_views & (at_border < AT_BORDER * level)
     if level <= 0 or 2 * inside.sum() <= valid_views.sum():
         return None
+    # Air is not quite empty: flats are of another time, and what scatters is everywhere.
+    first, last = np.median(left[inside]), np.median(right[inside])
+    air = np.linspace(first, last, columns)
+    profiles -= air
     centre, half_width = _window(profiles, inside)
     place = np.arange(columns) - centre[:, None]
     # Its ends move by parts of a pixel.
@@ -107,15 +101,14 @@ def projection_sums(
     mass, moment = np.empty((2, *radiographs.shape[:2]))
     for chunk in stream.chunks(views, radiographs.view_bytes):
         stream.report("pre-alignment: summing", chunk.start, views)
-        images = radiographs.read(chunk).astype(np.float64)
+        images = radiographs.read(chunk) - air
         mass[chunk] = np.einsum("vrc,vc->vr", images, weight[chunk])
         moment[chunk] = np.einsum("vrc,vc->vr", images, (weight * place)[chunk])
     within = (centre >= half_width) & (centre <= columns - 1 - half_width)
     whole = inside & within
     if 2 * whole.sum() <= valid_views.sum():
         return None
-    tilt = float(np.median((right - left)[whole])) / columns
-    return ProjectionSums(profiles, mass, moment, centre, half_width, whole, tilt)
+    return ProjectionSums(profiles, mass, moment, centre, half_width, whole)
 
 
 def _window(profiles: Floats, inside: NDArray[np.bool_]) -> tuple[Floats, float]:
