@@ -9,7 +9,7 @@ is left.
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,11 +20,8 @@ from clra.findings import Finding
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.prealignment.prealignment import (
-    Prealignment,
-    is_open,
-    prealigned,
-)
+from clra.methods.alignment.prealignment.axis_column import axis_column
+from clra.methods.alignment.prealignment.prealignment import Prealignment, is_open, prealigned
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import Rejections
 from clra.methods.alignment.reprojection import Registered
@@ -39,6 +36,7 @@ from clra.methods.alignment.steps.acceleration import MotionSteps
 from clra.methods.alignment.steps.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
+    State,
     history_from,
     history_values,
     motion_arrays,
@@ -85,6 +83,8 @@ class CoarseToFine:
         To report errors against.
     checkpoint : Checkpoint, optional
         Keeps each finished iteration.
+    make_level : callable
+        Makes a :class:`Level` of its first five arguments.
     """
 
     stream: Stream
@@ -97,8 +97,10 @@ class CoarseToFine:
     start: Motion
     truth: Motion | None = None
     checkpoint: Checkpoint | None = None
+    make_level: Callable[[Stream, Scan, Region, Solver, int], Level] = Level
     several: bool = field(init=False)  # iterations in the schedule
     motion: Motion = field(init=False)
+    origin: Motion = field(init=False)  # whose gauge stays
     history: list[Iteration] = field(init=False, default_factory=list)
     prealigned: Prealignment | None = field(init=False, default=None)
     registered: Registered | None = field(init=False, default=None)  # by the last iteration
@@ -108,11 +110,12 @@ class CoarseToFine:
     steps: MotionSteps = field(init=False)  # of the level
     rejected: NDArray[np.bool_] = field(init=False)
     rejections: Rejections = field(init=False)
+    position: tuple[int, int] = field(init=False, default=(0, 0))  # stage, iterations of it
 
     def __post_init__(self) -> None:
         excluded = () if self.scan.corrections is None else self.scan.corrections.excluded
         self.rejections = Rejections(self.scan.views, excluded)
-        self.motion = self.start
+        self.motion = self.origin = self.start
         points = sample_points(self.region.sample)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
@@ -145,6 +148,8 @@ class CoarseToFine:
         started = time.perf_counter()
         found = prealigned(self.stream, self.scan, coarsest, self.rejections, self.shift_gauge)
         if found is None:
+            column = axis_column(self.stream, self.scan)
+            self.motion = self.origin = replace(self.start, shift_u=self.start.shift_u + column)
             return
         self._begin_with(found)
         seconds = time.perf_counter() - started
@@ -157,12 +162,13 @@ class CoarseToFine:
         """Take shifts from a pre-alignment; magnifications are right on average, not in a view."""
         self.prealigned, self.rejections.vouched = found, found.vouched
         self.motion = replace(found.motion, magnification=self.start.magnification)
+        self.origin = self.motion
 
     def align_level(self, stage: Stage, index: int = 0, done: int = 0) -> None:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        level = Level(self.stream, self.scan, self.region, self.solver, stage.level)
+        level = self.make_level(self.stream, self.scan, self.region, self.solver, stage.level)
         if self.registered is None:
             self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
@@ -237,7 +243,7 @@ class CoarseToFine:
         self.found = self.rejections.settled(
             self.motion, there, self.rejected, first=first
         ).normalised()
-        there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
+        there = self.shift_gauge.anchored(self.found, self.origin) if self.anchor else self.found
         if self.prealigned is not None:
             there = self.prealigned.held(there, ~self.rejected, scale=self.scale)
         step = self.steps.step(self.motion, there)
@@ -275,23 +281,25 @@ class CoarseToFine:
             last.update_v_median,
             last.correlation,
         )
-        if self.checkpoint is None:
-            return
+        self.position = stage, done
+        if self.checkpoint is not None:
+            self.checkpoint.save(finished(self.history), *self.state())
+
+    def state(self) -> State:
+        """Return the plain values and arrays by which an interrupted alignment goes on."""
         level, update = self.last
         arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
         arrays |= {"rejected": self.rejected, "update": update}
         arrays["accepted"] = self.rejections.accepted
-        arrays |= prealigned_arrays(self.prealigned)
+        arrays |= prealigned_arrays(self.prealigned) | motion_arrays("origin", self.origin)
         values = {
-            "position": (stage, done),
+            "position": self.position,
             "history": history_values(self.history),
             "level": level,
             "fresh": self.fresh,
             "reasons": list(self.rejections.reasons.items()),
         }
-        self.checkpoint.save(
-            finished(self.history), values, arrays | registered_arrays(self.registered)
-        )
+        return values, arrays | registered_arrays(self.registered)
 
     def _go_on_from(self, saved: Saved) -> tuple[int, int]:
         """Take up a kept state; return the stage and how many of its iterations are done."""
@@ -300,10 +308,11 @@ class CoarseToFine:
         if before is not None:
             self._begin_with(before)
         self.history = history_from(values["history"])
-        stage, done = values["position"]
+        stage, done = self.position = tuple(values["position"])
         self.registered = registered_from(arrays)
         if self.registered is None:
             return stage, done
+        self.origin = motion_from(arrays, "origin", cause)
         self.motion = motion_from(arrays, "motion", cause)
         self.found = motion_from(arrays, "found", cause)
         self.rejected, self.fresh = arrays["rejected"], values["fresh"]

@@ -100,7 +100,7 @@ class HeldOut:
     def radiographs(self, valid_views: NDArray[np.bool_]) -> tuple[Radiographs, NDArray[np.intp]]:
         """Read and bin what is needed; the second value are the views that these are."""
         views = self.chosen(valid_views)
-        return Radiographs(self.stream, self.scan.subset(views), self.level), views
+        return Radiographs(self.stream, self.scan.subset(views), self.level, keep=True), views
 
     def predict(
         self,

@@ -14,6 +14,8 @@ from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 
 Arrays = Mapping[str, NDArray[Any]]
+State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
+"""Plain values and arrays, as :meth:`clra.methods.execution.checkpoint.Checkpoint.save` keeps."""
 
 
 def motion_arrays(name: str, motion: Motion) -> dict[str, NDArray[Any]]:

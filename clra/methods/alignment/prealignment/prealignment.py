@@ -152,7 +152,8 @@ def prealigned(
     rejections : Rejections
         What rejects views: they get what lies between their neighbours'.
     gauge : Gauge
-        What is taken out of the shifts.
+        What counts as no motion. It stays in what is found: the sample's centre of mass is on the
+        axis, where all views show it.
 
     Returns
     -------
@@ -192,14 +193,15 @@ def prealigned(
         radiographs.level * np.interp(views, good, shift)
         for shift in (along_u.shift, along_v.shift)
     )
-    motion = gauge.anchored(Motion(shift_u=shift_u, shift_v=shift_v))
+    motion = Motion(shift_u=shift_u, shift_v=shift_v)
     known, exact = np.zeros((3, geometry.views), np.bool_), np.zeros(2, np.bool_)
     if tells_slow_modes(geometry):
         told, exact = _accuracy(along_u, along_v, sums, radiographs.level)
         known[:, good] = told[[0, 1, 1], None] & sums.whole
         stretch = np.interp(views, good, along_v.stretch)
         motion = replace(motion, magnification=1 + stretch)
-    sides = zip((motion.shift_u, motion.shift_v), reversed(geometry.shape), strict=True)
+    rest = gauge.anchored(motion)
+    sides = zip((rest.shift_u, rest.shift_v), reversed(geometry.shape), strict=True)
     moved = max(float(np.std(shift)) / size for shift, size in sides)
     if moved < _LARGE and not known.any():
         return None

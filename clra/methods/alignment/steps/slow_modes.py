@@ -12,6 +12,11 @@ _HALF_WAVES, _VIEWS = 16, 6
 _SLOWEST = 0.9
 
 
+def half_waves(views: int) -> int:
+    """Return how many cosines count as slow among so many views."""
+    return max(1, min(_HALF_WAVES, views // _VIEWS))
+
+
 def slow_part(values: Floats, weight: Floats, damping: float = 0.0) -> Floats:
     """Fit cosines of few half waves over the scan.
 
@@ -31,8 +36,8 @@ def slow_part(values: Floats, weight: Floats, damping: float = 0.0) -> Floats:
         The fit, at all views.
     """
     views = len(values)
-    count = max(1, min(_HALF_WAVES, views // _VIEWS))
     angle = np.pi * (np.arange(views) + 0.5) / views
+    count = half_waves(views)
     basis = np.cos(np.multiply.outer(angle, np.arange(count)))
     basis[:, 1:] *= np.sqrt(2)  # each mode's mean square is 1
     root = np.sqrt(weight)
