@@ -35,7 +35,7 @@ def test_a_truncated_sample_is_less_certain_along_u():
         standard_errors(result(), left(0.2, 0.2), 2, truncated=truncated, tilts=False)
         for truncated in (False, True)
     )
-    assert cut[0, 0] == pytest.approx(2 * whole[0, 0]) and cut[0, 1] == pytest.approx(whole[0, 1])
+    assert cut[0, 0] == pytest.approx(2 * whole[0, 0]) and cut[0, 1] < 0.8 * cut[0, 0]
 
 
 def test_views_that_are_off_are_those_with_large_errors():
