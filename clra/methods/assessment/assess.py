@@ -83,7 +83,7 @@ def assess(
         after = predicted(start, True, "start")
     left = gauge.of(after)
     tilts = covered(scan.geometry) < np.pi - 1e-6
-    sigma = standard_errors(aligned, left, truncated=region.truncated, tilts=tilts)
+    sigma = standard_errors(aligned, left, held_out.level, truncated=region.truncated, tilts=tilts)
     # Phase correlation knows no standard errors.
     known = np.isfinite(sigma[:, :2]).all(axis=1)
     spread = sigma[known, :2].mean(axis=0) if known.any() else np.array(_rms(left)[:2])
