@@ -8,6 +8,7 @@ import typer
 
 from clra.app.console import Console, Memory, Reading
 from clra.app.correcting import Correcting
+from clra.app.planning.cluster_option import Cluster
 from clra.errors import InputError
 
 if TYPE_CHECKING:
@@ -172,6 +173,7 @@ def reconstruct(
             "--align", help="Align the scan first, as clra align would; imgr does it on the way."
         ),
     ] = False,
+    cluster: Cluster = None,
 ) -> None:
     """Reconstruct a volume.
 
@@ -188,11 +190,13 @@ def reconstruct(
       clra reconstruct helix.nxs -o volume.h5 --method katsevich --align
       clra reconstruct scan.nxs -o volume.h5 --method imgr --align
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
+      clra reconstruct scan.nxs -o volume.h5 --motion motion.h5 --cluster local:4
     """
     from clra.app.annotations import alignment_for
     from clra.app.arguments import volume_file
     from clra.app.exit_status import command_line, keeping
     from clra.app.scan_description import metric
+    from clra.app.session.overall_progress import align_parts, reconstruction_parts
     from clra.io.atomic import ensure_writable
     from clra.io.provenance import provenance
     from clra.io.volumes.raw_volume import sidecar
@@ -200,6 +204,7 @@ def reconstruct(
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.methods.reconstruction.iterative import options_for
     from clra.methods.reconstruction.reconstruct import METHODS, reconstruct_into
+    from clra.model.schedule import parse_schedule
 
     volume_file(out)
     limits = memory.limits()
@@ -235,7 +240,11 @@ def reconstruct(
         grid=grid,
     )
     checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
-    with console.progress() as progress, keeping(checkpoint):
+    parts = reconstruction_parts(method)
+    if align and method != "imgr":
+        stages = parse_schedule("auto", opened.cropped().geometry.shape)
+        parts = [*align_parts("ra", stages), *parts]
+    with console.progress(parts) as progress, keeping(checkpoint):
         with open_volume(out, grid, provenance=made, **stored) as target:
             done = reconstruct_into(
                 target,
@@ -249,6 +258,7 @@ def reconstruct(
                 corrections=correcting.options(),
                 progress=progress,
                 checkpoint=checkpoint,
+                cluster=cluster,
                 **sampled,
                 **limits,
             )

@@ -35,6 +35,10 @@ class Anderson:
 
     def __init__(self, memory: int = 3) -> None:
         self.memory = memory
+        self.forget()
+
+    def forget(self) -> None:
+        """Go on as if from the first step."""
         self._last: tuple[Floats, Floats] | None = None
         self._differences: list[tuple[Floats, Floats]] = []
 
@@ -89,6 +93,10 @@ class MotionSteps:
     def step(self, here: Motion, there: Motion) -> Floats:
         """Return the plain step in u, v and, if estimated, scale, (2 or 3, views) [pixel]."""
         return self._as_lengths(there) - self._as_lengths(here)
+
+    def forget(self) -> None:
+        """Extrapolate from no step so far."""
+        self._anderson.forget()
 
     def next(self, here: Motion, there: Motion, *, plain: bool) -> Motion:
         """Return the next motion.
