@@ -13,6 +13,7 @@ from clra.app.progress_bar import duration
 from clra.app.scan_description import Facts, table, views_flagged
 from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.alignment.rigid.rigid_parts import rigid_parts
 from clra.methods.assessment.quality import Quality
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.gauge.modes import GAUGE_MODES
@@ -232,6 +233,16 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "magnification": f"{least:.5f} to {most:.5f}",
         "confidence": f"median {np.median(confidence):.3f}, {views_flagged(result.flagged)}",
     }
+    parts = rigid_parts(result)
+    if parts:
+        values["rigid"] = {
+            name.replace("\u00b5", "u"): dict(zip(("rms", "largest", "sigma"), part, strict=True))
+            for name, part in parts.items()
+        }
+        turned = [part[0] for name, part in parts.items() if "degree" in name]
+        lines["rotation"] = (
+            f"{', '.join(f'{angle:.3f}' for angle in turned)} degrees rms about u, v, the beam"
+        )
     if result.gauge:
         lines["unobservable"] = _unobservable(result)
     if isinstance(judged, Quality):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
-from clra.methods.alignment.reprojection import Registered, binned_mask, reproject_and_register
+from clra.methods.alignment.reprojection import Registered, reproject_and_register, used_pixels
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -55,10 +55,10 @@ class Level:
     bias: Motion | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        grid = self.region.grid
-        self.grid = grid.binned(self.factor) if self.factor > 1 else grid
         # 1, 7: down-sample the measured radiographs
         self.radiographs = self._binned()
+        grid = self.region.grid
+        self.grid = grid.binned(self.factor) if self.factor > 1 else grid
 
     def residual_motion(
         self,
@@ -163,9 +163,7 @@ class Level:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Pixels of the binned detector that count."""
-        mask = self.scan.mask
-        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
-        return binned_mask(full, self.factor)
+        return used_pixels(self.scan, self.factor)
 
 
 @dataclass(frozen=True)

@@ -161,6 +161,12 @@ def binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:
     return np.asarray(blocks.all(axis=(1, 3)))
 
 
+def used_pixels(scan: Scan, level: int) -> NDArray[np.bool_]:
+    """Return the pixels of the binned detector that count in reconstructions."""
+    full = np.ones(scan.geometry.shape, np.bool_) if scan.mask is None else scan.mask
+    return binned_mask(full, level)
+
+
 def reprojected(
     stream: Stream, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, stage: str
 ) -> Iterator[tuple[slice, Array, Array]]:

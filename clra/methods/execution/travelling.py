@@ -14,9 +14,8 @@ from clra.errors import InputError
 from clra.model.scan import Scan
 from clra.ops.streaming.part_files import whole_file
 
-# Radiographs are stacks of images; what else travels as an array is one image or a few of them
-# (mean flat and dark fields, maps of bad pixels), or a number a view.
-_STACK = 3
+# Images of a stack that may travel: mean flat and dark fields, not radiographs.
+_FEW = 8
 
 
 def write_task(path: Path, value: Any) -> None:
@@ -104,7 +103,7 @@ def _Pickler(file: IO[bytes]) -> Any:  # noqa: N802  (a class that is made when 
         def persistent_id(self, value: Any) -> Any:
             if isinstance(value, np.memmap):
                 return _place(value)
-            if isinstance(value, np.ndarray) and value.ndim == _STACK:
+            if isinstance(value, np.ndarray) and value.ndim == 3 and len(value) > _FEW:
                 raise InputError("radiographs in memory")
             return None
 

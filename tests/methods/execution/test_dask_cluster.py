@@ -13,6 +13,7 @@ from clra.errors import Cancelled, ClusterError
 from clra.methods.execution import worker_facts, worker_process
 from clra.methods.execution.dask_cluster import DaskCluster
 from clra.methods.execution.travelling import Shared, check_travels, read_task, write_task
+from clra.model.grid import default_grid
 
 distributed = pytest.importorskip("distributed")
 
@@ -138,6 +139,13 @@ def test_a_client_that_is_stopped_goes_on(client, scans, alone, tmp_path):
     )
     assert not any(stage.startswith("QR") for stage in stages)
     assert errors(again.motion.columns(), alone["helix"].motion.columns()) < MOTION
+
+
+def test_a_cluster_is_started_for_a_call(scans):
+    grid = default_grid(scans["helix"].geometry).slab(40, 44)
+    shared = clra.reconstruct(scans["helix"], grid=grid, cluster="local:1")
+    alone = clra.reconstruct(scans["helix"], grid=grid)
+    np.testing.assert_array_equal(shared, alone)
 
 
 def test_radiographs_in_memory_are_refused(client, scans):
