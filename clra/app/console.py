@@ -6,9 +6,9 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 
@@ -23,6 +23,7 @@ from clra.errors import InputError
 from clra.findings import collected, collected_so_far
 
 if TYPE_CHECKING:
+    from clra.app.session.overall_progress import Part
     from clra.io.scanners.scanner_options import ScannerOptions
     from clra.io.scanners.scanner_scan import ScannerScan
     from clra.model.motion import Motion
@@ -53,9 +54,9 @@ class Console:
     )
 
     @contextmanager
-    def progress(self) -> Iterator["ProgressCallback"]:
-        """Show progress on stderr while a block runs, unless quiet; and in the log."""
-        with progress_bar.shown(self.quiet) as report:
+    def progress(self, parts: Sequence["Part"] = ()) -> Iterator["ProgressCallback"]:
+        """Show progress on stderr while a block with such parts runs, unless quiet; and log it."""
+        with progress_bar.shown(self.quiet, parts) as report:
             yield stages_logged(report)
 
     def result(self, values: Mapping[str, Any], text: str) -> None:
@@ -169,23 +170,24 @@ class Reading:
 
     def scanner(self, path: Path) -> "ScannerScan | None":
         """Read the metadata of a scanner; None of an NXtomo file."""
-        from clra.io.scanners.recognise import read_scanner, recognise
+        from clra.io.scanners.recognise import read_scanner
 
-        return None if recognise(path) is None else read_scanner(path, self._options())
+        return read_scanner(path, self._options())
 
-    def start_motion(self, path: Path, views: int) -> "Motion | None":
+    def start_motion(self, path: Path, scan: "Scan") -> "Motion | None":
         """Read a motion of a table, or that a scanner's software measured; None of other files."""
         from clra.io.motion_formats.motion_csv import is_motion_csv, read_motion_csv
         from clra.io.scanners.recognise import holds_start_motion, read_start_motion
 
         if is_motion_csv(path):
-            motion = read_motion_csv(path)[0]
-            if motion.views != views:
-                raise InputError.at(path, "view", f"{motion.views} views", f"{views} of the scan")
+            motion = read_motion_csv(path, scan.geometry)[0]
+            if motion.views != scan.views:
+                there = f"{scan.views} of the scan"
+                raise InputError.at(path, "view", f"{motion.views} views", there)
             return motion
         if not holds_start_motion(path):
             return None
-        return read_start_motion(path, views, self._options())
+        return read_start_motion(path, scan.views, self._options())
 
     def _options(self) -> "ScannerOptions":
         from clra.io.scanners.scanner_options import ScannerOptions
@@ -225,15 +227,11 @@ class Reading:
 
     def geometry(self) -> str:
         """Say by which options the geometry was told, if by any."""
-        told = replace(self, entry=None, white=None).as_typed().strip()
-        return told or "no --rotation, --source-distance or --parallel"
-
-    def as_typed(self) -> str:
-        """Return the options that were given, as on the command line."""
-        given = [(f.name, getattr(self, f.name)) for f in fields(self)]
-        changed = [(n, v) for (n, v), f in zip(given, fields(self), strict=True) if v != f.default]
-        words = (f" --{n.replace('_', '-')}" + ("" if v is True else f" {v}") for n, v in changed)
-        return "".join(words)
+        options = [f for f in fields(self) if f.name not in ("entry", "white")]
+        given = [(f.name, getattr(self, f.name)) for f in options]
+        changed = [(n, v) for (n, v), f in zip(given, options, strict=True) if v != f.default]
+        words = (f"--{n.replace('_', '-')}" + ("" if v is True else f" {v}") for n, v in changed)
+        return " ".join(words) or "no --rotation, --source-distance or --parallel"
 
 
 def to_json(values: Mapping[str, Any]) -> str:

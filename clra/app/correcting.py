@@ -55,13 +55,3 @@ class Correcting:
             beam_hardening=() if hardening is None else coefficients("--beam-hardening", hardening),
             exclude=() if self.exclude is None else view_numbers("--exclude", self.exclude),
         )
-
-    def as_typed(self) -> str:
-        """Return the options that were given, as on the command line."""
-        parts = [
-            "" if self.exclude is None else f" --exclude {self.exclude}",
-            " --rings" * self.rings,
-            "" if self.beam_hardening is None else f" --beam-hardening {self.beam_hardening}",
-            " --no-corrections" * self.no_corrections,
-        ]
-        return "".join(parts)

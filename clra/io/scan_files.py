@@ -17,7 +17,7 @@ from clra.io.nxtomo.fields import Overrides
 from clra.io.nxtomo.reader import read_nxtomo
 from clra.io.nxtomo.writer import write_nxtomo
 from clra.io.provenance import Provenance
-from clra.io.scanners.recognise import read_scanner, recognise
+from clra.io.scanners.recognise import read_scanner
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import ScannerScan
 from clra.model.detector_pose import flipped, with_axis_at
@@ -91,9 +91,8 @@ def read_scan(
         "centre_offset": centre_offset,
     }
     said = {name: value for name, value in given.items() if value is not None}
-    if recognise(path) is not None:
-        scanner = read_scanner(path, replace(options or ScannerOptions(), **said))
-        assert scanner is not None  # it is recognised
+    scanner = read_scanner(path, replace(options or ScannerOptions(), **said))
+    if scanner is not None:
         return scanner.scan(white)
     overrides = Overrides(rotation or "ccw", source_distance, parallel)
     scan = read_nxtomo(path, entry=entry, overrides=overrides, white=white)

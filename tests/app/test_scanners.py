@@ -119,6 +119,10 @@ def test_wrong_things_to_import(tmp_path: Path, clra) -> None:
     out = tmp_path / "scan.nxs"
     for options, part in (
         ([path, "--flat", "flat.tif"], "found frames, expected none: they come from the scan"),
+        ([path, "--kind", "transmission"], "--kind: found transmission, expected none: its meta"),
+        ([path, "--dtype", "float32"], "--dtype: found float32, expected none: its metadata tell"),
+        ([path, "--byteorder", "big"], "--byteorder: found big, expected none: its metadata tell"),
+        ([path, "--header", 0], "--header: found 0, expected none: its metadata tell it"),
         ([path, "--rotation", "left"], "--rotation: rotation: found 'left', expected ccw or cw"),
         ([path, "--flip", "sideways"], "--flip: flip: found 'sideways', expected one of columns"),
         ([path, "--centre-offset", "1,2,3"], "expected COLUMN or COLUMN,ROW"),

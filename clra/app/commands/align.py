@@ -110,11 +110,13 @@ def align(
     """
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
-    from clra.app.exit_status import InterruptedCommandError, keeping
+    from clra.app.exit_status import InterruptedCommandError, command_line, keeping
     from clra.app.report.summary import Errors, findings_of, summary_of
+    from clra.app.session.overall_progress import align_parts, report_parts
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
     from clra.io.provenance import provenance
+    from clra.io.volumes.raw_volume import sidecar
     from clra.io.volumes.volume_files import write_volume
     from clra.methods.alignment.align import align as align_scan
     from clra.methods.alignment.autofocus import autofocus as find_focus
@@ -135,28 +137,26 @@ def align(
     limits = memory.limits()
     ensure_writable(out, keep=(scan, reference))  # it may be --start: that is read by then
     kept = [scan, reference, start, out]
-    for path in (report, volume):
+    beside = sidecar(volume) if volume is not None and volume.suffix.lower() == ".raw" else None
+    for path in (report, volume, beside):
         if path is not None:
             ensure_writable(path, kept)
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    measured = None if start is None else reading.start_motion(start, opened.views)
+    measured = None if start is None else reading.start_motion(start, opened)
     earlier = None if start is None or measured is not None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
     about = {
         "file": str(scan.absolute()),
         "geometry": reading.geometry(),
-        "command": f"clra align {scan} -o {out} --method {method} --schedule {schedule} "
-        f"--estimate {estimate} --gauge {gauge}"
-        f"{'' if reference is None else f' --reference {reference}'}"
-        f"{'' if start is None else f' --start {start}'}"
-        f"{' --autofocus' if autofocus else ''}{reading.as_typed()}"
-        f"{correcting.as_typed()}",
+        "command": command_line(),
     }
+    stages = () if method != "ra" else parse_schedule(schedule, opened.cropped().geometry.shape)
     checkpoint = Checkpoint(f"{out}.resume", resume=resume)
-    with console.progress() as progress, keeping(checkpoint):
+    parts = [*align_parts(method, stages), *report_parts(report is not None)]
+    with console.progress(parts) as progress, keeping(checkpoint):
         opened = prepared(opened, correcting.options(), progress=progress)
         if autofocus:
             focus = find_focus(opened, console.device, progress=progress, **limits)
@@ -210,7 +210,7 @@ def align(
             )
             write_report(report, findings)
     values, text = summary_of(result, errors)
-    beside = {"volume": volume, "report": report}
-    written = {"file": out, **{name: path for name, path in beside.items() if path}}
+    more = {"volume": volume, "report": report}
+    written = {"file": out, **{name: path for name, path in more.items() if path}}
     names = " and ".join(str(path) for path in written.values())
     console.summary({**written, **values}, f"wrote {names}\n{text}")

@@ -69,25 +69,29 @@ def import_scan(
         ),
     ] = None,
     kind: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="counts|transmission|line-integrals",
-            help="What frames hold; transmission (I/I0) and line integrals (-log of it) have no "
-            "flats and darks.",
+            help="What frames hold, by default counts; transmission (I/I0) and line integrals "
+            "(-log of it) have no flats and darks.",
         ),
-    ] = "counts",
+    ] = None,
     shape: Annotated[
         str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Of headerless frames.")
     ] = None,
     dtype: Annotated[
-        str, typer.Option(metavar="TYPE", help="Of headerless pixels, as numpy calls it.")
-    ] = "uint16",
+        str | None,
+        typer.Option(
+            metavar="TYPE", help="Of headerless pixels, as numpy calls it; by default uint16."
+        ),
+    ] = None,
     byteorder: Annotated[
-        str, typer.Option(metavar="little|big", help="Of headerless pixels.")
-    ] = "little",
+        str | None,
+        typer.Option(metavar="little|big", help="Of headerless pixels; by default little."),
+    ] = None,
     header: Annotated[
-        int, typer.Option(metavar="BYTES", help="To skip at the start of each binary file.")
-    ] = 0,
+        int | None, typer.Option(metavar="BYTES", help="To skip at the start of each binary file.")
+    ] = None,
     z_translation: Annotated[
         str | None,
         typer.Option(metavar="FILE", help="How far the sample is raised [mm], a line a view."),
@@ -178,6 +182,10 @@ def import_scan(
         if flat or flat_after or dark:
             given = "--flat, --flat-after or --dark"
             raise InputError.at(scanner.path, given, "frames", "none: they come from the scan")
+        framed = {"--kind": kind, "--dtype": dtype, "--byteorder": byteorder, "--header": header}
+        for name, told in framed.items():
+            if told is not None:
+                raise InputError.at(scanner.path, name, told, "none: its metadata tell it")
         if axis != "vertical":
             raise InputError.at(scanner.path, "--axis", axis, "vertical: it is for frames")
         _import_scanner(console, scanner, out, excluded, flipped=flip is not None)
@@ -201,11 +209,11 @@ def import_scan(
             flats=flat or (),
             flats_after=flat_after or (),
             darks=dark or (),
-            kind=kind,
+            kind=kind or "counts",
             shape=pixels,
-            dtype=dtype,
-            byteorder=byteorder,
-            header=header,
+            dtype=dtype or "uint16",
+            byteorder=byteorder or "little",
+            header=header or 0,
             z_translation=z_translation,
             centre_offset=0.0 if place is None else place[0],
             rotation=rotation or "ccw",
@@ -221,7 +229,7 @@ def import_scan(
         f"wrote {out}: {made.views} radiographs of {rows} x {columns}, {made.flats} flats, "
         f"{made.darks} darks; the sample turns from {first:g} to {last:g} degrees",
     )
-    if kind == "counts" and not made.flats:
+    if kind in (None, "counts") and not made.flats:
         _warn_of_no_flats(out)
 
 

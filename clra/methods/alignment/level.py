@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
-from clra.methods.alignment.reprojection import Registered, binned_mask, reproject_and_register
+from clra.methods.alignment.reprojection import Registered, reproject_and_register, used_pixels
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -163,9 +163,7 @@ class Level:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Pixels of the binned detector that count."""
-        mask = self.scan.mask
-        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
-        return binned_mask(full, self.factor)
+        return used_pixels(self.scan, self.factor)
 
 
 @dataclass(frozen=True)

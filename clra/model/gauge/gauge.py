@@ -31,6 +31,11 @@ _COMMON = 0.05
 # translation 0.7 to 1, a tilt or stretch of a sample many detectors high 0.5 to 0.9. A circle,
 # whose views see all of the sample: a tilt or stretch below 0.1, and there the data see it well.
 _IMITATED = 0.25
+# The same for a tilt or stretch to be taken out of an alignment: the data see much of one that is
+# imitated less, and taken out by force it holds other motions off them. With 0.25 a helix ended at
+# 0.035, 0.025 pixel (u, v), half a fan at 0.050, 0.076; with this, which few tilts reach, at 0.010,
+# 0.008 and 0.012, 0.011. With stretches left in, the paper's smooth motions end at 0.10 in v.
+_ANCHORED = 0.65
 
 # Robust standard deviations beyond which a view's shift does not count when the gauge is taken out:
 # a uniform jitter stays within 1.4, a normal one of 3456 views within 4.
@@ -109,10 +114,14 @@ class Gauge:
         # A movement that shifts of the radiographs hardly imitate is no gauge of this scan, and its
         # column, scaled up, would be noise.
         shown = np.sqrt(np.mean(np.sum(columns[:2] ** 2, axis=0), axis=0))
-        imitated = shown >= _IMITATED * self._sizes(geometry, np.asarray(points))
+        part = shown / self._sizes(geometry, np.asarray(points))
+        imitated, anchored = part >= _IMITATED, part >= _ANCHORED
+        anchored[:3] = imitated[:3]  # translations
         if magnification:
-            imitated[self.modes.index("scale")] = True
+            scale = self.modes.index("scale")
+            imitated[scale] = anchored[scale] = True
         self._design = _rows(columns * imitated, self._weight)
+        self._anchored = _rows(columns * anchored, self._weight)
 
     def _sizes(self, geometry: ConeBeamGeometry, points: Floats) -> Floats:
         """RMS displacement of the points on the detector for a unit of each mode [pixel]."""
@@ -158,7 +167,7 @@ class Gauge:
         )
 
     def anchored(self, motion: Motion, start: Motion | None = None) -> Motion:
-        """Return the motion without its gauge.
+        """Return the motion without its gauge, but for tilts and stretches that the data see.
 
         Parameters
         ----------
@@ -174,9 +183,10 @@ class Gauge:
             shift_v=motion.shift_v - start.shift_v,
             magnification=motion.magnification / start.magnification,
         )
-        fit = self.fit(came)
-        far = _far(fit.remainder[:, 0]) | _far(fit.remainder[:, 1])
-        rest = fit.remainder if not far.any() else self._remainder(came, ~far)
+        rest = self._remainder(came, np.ones(self.views, np.bool_))
+        far = _far(rest[:, 0]) | _far(rest[:, 1])
+        if far.any():
+            rest = self._remainder(came, ~far)
         return Motion(
             shift_u=start.shift_u + rest[:, 0],
             shift_v=start.shift_v + rest[:, 1],
@@ -185,12 +195,12 @@ class Gauge:
         )
 
     def _remainder(self, motion: Motion, chosen: NDArray[np.bool_]) -> Floats:
-        """Return what is left of a motion, (views, 3), if the modes are fitted to some views."""
+        """Return what anchoring leaves of a motion, (views, 3), with modes fitted to some views."""
         table, used = _table(motion), self._weight > 0
         target = _rows(table.T, self._weight)
         rows = np.tile(chosen, np.count_nonzero(used))
-        coefficients = _least_squares(self._design[rows], target[rows], 1e-9)
-        part = (self._design @ coefficients).reshape(-1, self.views).T
+        coefficients = _least_squares(self._anchored[rows], target[rows], 1e-9)
+        part = (self._anchored @ coefficients).reshape(-1, self.views).T
         table[:, used] -= part / self._weight[used]
         return table
 

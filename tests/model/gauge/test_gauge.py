@@ -258,7 +258,7 @@ def test_anchoring_takes_out_what_the_sample_could_have_done() -> None:
     geometry = helix(400, angle_step=0.2, z_step=0.014, **STAGE)
     points = sample_points(default_grid(geometry))
     columns = gauge_columns(geometry, points).reshape(3, 400, -1)
-    shift = columns[:2] @ [0.01, -0.02, 0.015, 0.002, 0.001, 0.0, 0.004]
+    shift = columns[:2] @ [0.01, -0.02, 0.015, 0.0, 0.0, 0.0, 0.004]
     moved = Motion(shift_u=shift[0], shift_v=shift[1])
     anchored = Gauge(geometry, points, magnification=False).anchored(moved)
     assert np.abs(shift).max() > 0.5
@@ -285,3 +285,17 @@ def test_movements_that_shifts_cannot_imitate_are_no_gauge() -> None:
     wobble = np.sin(np.linspace(0, 2 * np.pi, 90, endpoint=False))
     visible = Motion(shift_u=np.zeros(90), shift_v=wobble)
     assert np.abs(gauge.anchored(visible).shift_v - wobble).max() < 0.02
+
+
+def test_tilts_that_the_data_see_are_not_taken_out(scan, points) -> None:
+    """Translations and stretches of this helix are, its tilts shift the images by half of them."""
+    gauge = Gauge(scan, points, magnification=False)
+    for mode, stays in (("translation x", 0), ("stretch z", 0), ("tilt x", 1)):
+        moved = gauge_motion(scan, points, 0.01 * np.equal(GAUGE_MODES, mode))
+        shifts = Motion(shift_u=moved.shift_u, shift_v=moved.shift_v)
+        left = gauge.anchored(shifts)
+        assert gauge.fit(shifts).remainder == pytest.approx(0, abs=ROUNDING)
+        kept = np.linalg.norm([left.shift_u, left.shift_v]) / np.linalg.norm(
+            [moved.shift_u, moved.shift_v]
+        )
+        assert kept == pytest.approx(stays, abs=0.1), mode

@@ -11,6 +11,10 @@ Floats = NDArray[np.float64]
 
 _GAIN, _DIFFERENCE = 6, 7  # the simulated radiograph, and measured less simulated
 _RIDGE = 1e-12  # of the diagonal: parameters that a view does not show stay 0
+# White noise behind a low-pass of sigma s counts as one sample in 4 pi s^2 pixels; the derivatives
+# have most of their power where the low-pass leaves less of the noise, between 1/2 for white ones
+# and 1/sqrt(2) for those of edges. Estimates from noisy re-projections of balls scatter so.
+_IN_BAND = 0.6
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class RigidStep:
 
 
 def solve(
-    totals: Floats, free: tuple[int, ...], prior: Floats, weight: float, correlated: float
+    totals: Floats, free: tuple[int, ...], prior: Floats, weight: float, low_pass: float
 ) -> RigidStep:
     """Solve the normal equations.
 
@@ -54,9 +58,10 @@ def solve(
         Expected standard deviation of each step; 0 for unknown.
     weight : float
         Sum of the weights of the pixels.
-    correlated : float
-        Pixels whose noise counts as one sample.
+    low_pass : float
+        Sigma of the band-pass that the images are behind [pixel].
     """
+    correlated = max(1.0, _IN_BAND * 4 * np.pi * low_pass**2)  # pixels that count as one sample
     views, count = len(totals), len(free)
     gram = np.empty((views, IMAGES, IMAGES))
     upper = np.triu_indices(IMAGES)
