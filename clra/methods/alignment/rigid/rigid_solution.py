@@ -15,10 +15,10 @@ _RIDGE = 1e-12  # of the diagonal: parameters that a view does not show stay 0
 # have most of their power where the low-pass leaves less of the noise, between 1/2 for white ones
 # and 1/sqrt(2) for those of edges. Estimates from noisy re-projections of balls scatter so.
 _IN_BAND = 0.6
-# Bands of rows below which their scatter says nothing; and the part of it that stays once the bias
-# is taken off: balls of equal contrast scatter 3 times as much as white noise would, and end at 0.7
-# times its standard errors; a dense ball with faint ones inside scatters 200 times as much.
-_FEW, _STAYS = 4, 0.25
+# Bands of rows below which their scatter says nothing; and the part of its variance that stays once
+# the bias is taken off. Balls of equal contrast scatter 3 times as much as white noise would, a
+# rock 40 times in v, a dense ball with faint ones inside 200 times in the rotation about u.
+_FEW, _STAYS = 4, 0.06
 
 
 @dataclass(frozen=True)
