@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from clra.errors import InputError
 from clra.findings import collected, collected_so_far
 
 if TYPE_CHECKING:
+    from clra.app.session.overall_progress import Part
     from clra.io.scanners.scanner_options import ScannerOptions
     from clra.io.scanners.scanner_scan import ScannerScan
     from clra.model.motion import Motion
@@ -53,9 +54,9 @@ class Console:
     )
 
     @contextmanager
-    def progress(self) -> Iterator["ProgressCallback"]:
-        """Show progress on stderr while a block runs, unless quiet; and in the log."""
-        with progress_bar.shown(self.quiet) as report:
+    def progress(self, parts: Sequence["Part"] = ()) -> Iterator["ProgressCallback"]:
+        """Show progress on stderr while a block with such parts runs, unless quiet; and log it."""
+        with progress_bar.shown(self.quiet, parts) as report:
             yield stages_logged(report)
 
     def result(self, values: Mapping[str, Any], text: str) -> None:

@@ -3,9 +3,11 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
+
+from clra.app.session.overall_progress import Overall, Part, overall_of
 
 if TYPE_CHECKING:
     from clra.progress import Progress, ProgressCallback
@@ -39,17 +41,27 @@ class Lines:
         Where to write.
     clock : callable
         Seconds that have passed.
+    overall : Overall, optional
+        Keeps account of the whole command: then it is this whose remaining time is told.
     """
 
-    def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        stream: TextIO,
+        clock: Callable[[], float] = time.monotonic,
+        overall: Overall | None = None,
+    ) -> None:
         self._stream = stream
         self._clock = clock
+        self._overall = overall
         self._stage = ""
         self._started = self._last = clock() - _INTERVAL_OF_NEW_STAGES
 
     def __call__(self, progress: "Progress") -> None:
         """Write a line if it is time for one."""
         now = self._clock()
+        if self._overall is not None:
+            self._overall.update(progress)
         new = progress.stage != self._stage
         if new:
             self._stage, self._started = progress.stage, now
@@ -59,20 +71,32 @@ class Lines:
             return  # what comes next tells it
         self._last = now
         line = f"{progress.stage}: {progress.done} of {progress.total}"
-        if progress.done and not new:
+        if self._overall is not None:
+            line += f"; {all_told(self._overall)}"
+        elif progress.done and not new:
             left = (now - self._started) * (progress.total - progress.done) / progress.done
             line += f", about {duration(left)} left"
         print(line, file=self._stream, flush=True)
 
 
+def all_told(overall: Overall) -> str:
+    """Say how far a command is: "35 % of all, about 2 min 05 s left"."""
+    left = overall.left
+    rest = "" if math.isnan(left) else f", about {duration(left)} left"
+    return f"{math.floor(100 * overall.part)} % of all{rest}"
+
+
 @contextmanager
-def shown(quiet: bool) -> Iterator["ProgressCallback"]:
+def shown(quiet: bool, parts: Sequence[Part] = ()) -> Iterator["ProgressCallback"]:
     """Show progress while the block runs.
 
     Parameters
     ----------
     quiet : bool
         Show nothing.
+    parts : sequence of Part
+        Of the work in the block: with several, and within
+        :func:`clra.app.session.overall_progress.several_steps`, progress is that of it all.
 
     Yields
     ------
@@ -82,14 +106,14 @@ def shown(quiet: bool) -> Iterator["ProgressCallback"]:
     if quiet:
         yield lambda progress: None
     elif sys.stderr.isatty():
-        with _bar() as report:
+        with _bar(overall_of(parts)) as report:
             yield report
     else:
-        yield Lines(sys.stderr)
+        yield Lines(sys.stderr, overall=overall_of(parts))
 
 
 @contextmanager
-def _bar() -> Iterator["ProgressCallback"]:
+def _bar(overall: Overall | None) -> Iterator["ProgressCallback"]:
     from rich import progress as bars
     from rich.console import Console
 
@@ -98,15 +122,25 @@ def _bar() -> Iterator["ProgressCallback"]:
         bars.BarColumn(),
         bars.TaskProgressColumn(),
         bars.TimeElapsedColumn(),
-        bars.TextColumn("left"),
-        bars.TimeRemainingColumn(),
+        *(
+            [bars.TextColumn("left"), bars.TimeRemainingColumn()]
+            if overall is None
+            else [bars.TextColumn("{task.fields[told]}")]
+        ),
     )
     with bars.Progress(*columns, console=Console(stderr=True), transient=True) as display:
-        task = display.add_task("", total=None)
+        task = display.add_task("", total=None, told="")
         stage = None
 
         def report(progress: "Progress") -> None:
             nonlocal stage
+            if overall is not None:
+                overall.update(progress)
+                told = all_told(overall)
+                display.update(
+                    task, description=progress.stage, completed=overall.part, total=1.0, told=told
+                )
+                return
             if progress.stage != stage:
                 stage = progress.stage
                 display.reset(task, description=stage, total=progress.total)

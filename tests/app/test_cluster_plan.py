@@ -14,7 +14,7 @@ from clra.ops.runtime.devices import choose_device
 from clra.ops.streaming.memory import Budgets
 
 SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
-FREE = Site(file_system=1e30, link=1e30, task_s=0.0, view_s=0.0)
+FREE = Site(file_system=1e30, link=1e30, begin_s=0.0, task_s=0.0, view_s=0.0)
 
 
 def workers(count, **changes):
@@ -58,8 +58,8 @@ def test_plans_of_a_scan():
     assert [plan.work for plan in one] == ["fbp, full resolution", "align, 4ER-1QR-1HR"]
     for alone, shared in zip(one, many, strict=True):
         assert alone.efficiency == pytest.approx(1, abs=0.02)
-        # radiographs that several slabs see are filtered for each
-        assert alone.seconds / 8 < shared.seconds < alone.seconds / 2
+        # radiographs that several slabs see are read and filtered for each
+        assert alone.seconds / 8 < shared.seconds < alone.seconds
         assert shared.efficiency == pytest.approx(alone.seconds / 8 / shared.seconds, rel=0.02)
         assert shared.read_bytes > alone.read_bytes
     slow = plans(geometry, workers(8), replace(FREE, file_system=1e6))

@@ -113,6 +113,7 @@ def align(
     from clra.app.arguments import volume_file
     from clra.app.exit_status import InterruptedCommandError, command_line, keeping
     from clra.app.report.summary import Errors, findings_of, summary_of
+    from clra.app.session.overall_progress import align_parts, report_parts
     from clra.io.alignment_file import read_alignment, write_alignment
     from clra.io.atomic import ensure_writable
     from clra.io.provenance import provenance
@@ -153,8 +154,10 @@ def align(
         "geometry": reading.geometry(),
         "command": command_line(),
     }
+    stages = () if method != "ra" else parse_schedule(schedule, opened.cropped().geometry.shape)
     checkpoint = Checkpoint(f"{out}.resume", resume=resume)
-    with console.progress() as progress, keeping(checkpoint):
+    parts = [*align_parts(method, stages), *report_parts(report is not None)]
+    with console.progress(parts) as progress, keeping(checkpoint):
         opened = prepared(opened, correcting.options(), progress=progress)
         if autofocus:
             focus = find_focus(opened, console.device, progress=progress, **limits)

@@ -196,6 +196,7 @@ def reconstruct(
     from clra.app.arguments import volume_file
     from clra.app.exit_status import command_line, keeping
     from clra.app.scan_description import metric
+    from clra.app.session.overall_progress import align_parts, reconstruction_parts
     from clra.io.atomic import ensure_writable
     from clra.io.provenance import provenance
     from clra.io.volumes.raw_volume import sidecar
@@ -203,6 +204,7 @@ def reconstruct(
     from clra.methods.execution.checkpoint import Checkpoint
     from clra.methods.reconstruction.iterative import options_for
     from clra.methods.reconstruction.reconstruct import METHODS, reconstruct_into
+    from clra.model.schedule import parse_schedule
 
     volume_file(out)
     limits = memory.limits()
@@ -238,7 +240,11 @@ def reconstruct(
         grid=grid,
     )
     checkpoint = Checkpoint(f"{out}.resume", resume=iterating.resume)
-    with console.progress() as progress, keeping(checkpoint):
+    parts = reconstruction_parts(method)
+    if align and method != "imgr":
+        stages = parse_schedule("auto", opened.cropped().geometry.shape)
+        parts = [*align_parts("ra", stages), *parts]
+    with console.progress(parts) as progress, keeping(checkpoint):
         with open_volume(out, grid, provenance=made, **stored) as target:
             done = reconstruct_into(
                 target,

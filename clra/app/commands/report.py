@@ -37,6 +37,7 @@ def report(
     from clra.app.annotations import matched
     from clra.app.report.html_report import write_report
     from clra.app.report.summary import findings_of
+    from clra.app.session.overall_progress import report_parts
     from clra.io.alignment_file import read_alignment
     from clra.io.atomic import ensure_writable
 
@@ -46,7 +47,7 @@ def report(
     opened = None if scan is None else reading.scan(scan)
     if opened is not None:
         opened = matched(opened, result, motion, reading.geometry())
-    with console.progress() as progress:
+    with console.progress(report_parts(scan is not None)) as progress:
         findings = findings_of(result, opened, device=console.device, progress=progress, **limits)
     write_report(out, findings)
     told = {} if findings.quality is None else {"quality": findings.quality}

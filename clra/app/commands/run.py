@@ -46,6 +46,7 @@ def run(
     """
     from clra.app.arguments import volume_file
     from clra.app.exit_status import as_command
+    from clra.app.session.overall_progress import STEPS, several_steps
     from clra.io.scanners.recognise import recognise_or_none
 
     volume_file(out / volume)
@@ -65,6 +66,7 @@ def run(
         unfinished = Path(f"{made}.resume").exists()
         if resume and made.exists() and not unfinished:
             return
+        overall.begin(name)
         given = [*words, "-o", str(made), *common]
         given += ["--resume"] if resume and unfinished else []
         with as_command([name, *given]), group.make_context("clra", [name, *given]) as inner:
@@ -73,11 +75,14 @@ def run(
     given = Path(scan[0])
     motion, page = out / "motion.h5", out / "report.html"
     ready = given.suffix.lower() in (".nxs", ".nx", ".h5", ".hdf5")
-    if len(scan) > 1 or not ready or recognise_or_none(given) is not None:
-        given = out / "scan.nxs"
-        step("import", given, *scan)
-    step("align", motion, str(given), *working)
-    step("reconstruct", out / volume, str(given), "--motion", str(motion), *working)
-    step("report", page, str(motion), "--scan", str(given), *working)
+    importing = len(scan) > 1 or not ready or recognise_or_none(given) is not None
+    steps = {name: work for name, work in STEPS.items() if importing or name != "import"}
+    with several_steps(steps) as overall:
+        if importing:
+            given = out / "scan.nxs"
+            step("import", given, *scan)
+        step("align", motion, str(given), *working)
+        step("reconstruct", out / volume, str(given), "--motion", str(motion), *working)
+        step("report", page, str(motion), "--scan", str(given), *working)
     values = {"scan": given, "motion": motion, "volume": out / volume, "report": page}
     console.summary(values, f"look at {page}")

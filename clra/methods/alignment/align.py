@@ -14,7 +14,7 @@ from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult,
 from clra.methods.alignment.rigid.held_out_errors import with_standard_errors
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
 from clra.methods.alignment.rigid.rigid_start import RigidStart
-from clra.methods.assessment.quality import assess
+from clra.methods.assessment.assess import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
 from clra.methods.execution.checkpoint import (

@@ -67,6 +67,11 @@ class Registered:
     residual: Floats
     sigma: Floats
 
+    @property
+    def unexplained(self) -> Floats:
+        """Part of each measured radiograph that its simulated counterpart is not, (views,)."""
+        return np.sqrt(1 - np.clip(self.correlation, 0, 1) ** 2)
+
 
 def with_margin(grid: VolumeGrid) -> VolumeGrid:
     """Return a grid with planes added at both ends, for what views at the ends of a scan see."""

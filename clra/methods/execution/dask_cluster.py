@@ -18,7 +18,7 @@ from typing import Any
 
 from clra.errors import ClusterError, DeviceError, InputError
 from clra.findings import Finding
-from clra.methods.execution.executor import Item, Result, Task
+from clra.methods.execution.executor import Item, Result, Task, slabs_of
 from clra.methods.execution.travelling import Shared, write_task
 from clra.methods.execution.worker_facts import LOOK, PATIENCE, Ready, known_workers
 from clra.methods.execution.worker_process import Outcome, Settings, run
@@ -106,6 +106,10 @@ class DaskCluster:
     def close(self) -> None:
         """Remove the files of this call."""
         shutil.rmtree(self._root, ignore_errors=True)
+
+    def parts(self, shape: tuple[int, int, int]) -> list[slice]:
+        """Cut the planes of a volume (nz, ny, nx) into tasks; see :func:`slabs_of`."""
+        return slabs_of(self.places, self.slab_bytes, shape)
 
     def share(self, value: Any) -> Shared:
         """Write a value once for all tasks that use it."""

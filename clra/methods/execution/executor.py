@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import ClusterError
 from clra.ops.streaming.part_files import PlaneParts
 from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import PlaneWriter
@@ -43,6 +44,10 @@ class Executor(Protocol):
     @property
     def folder(self) -> Path | None:
         """Where tasks leave files; see above."""
+        ...
+
+    def parts(self, shape: tuple[int, int, int]) -> list[slice]:
+        """Cut the planes of a volume (nz, ny, nx) into tasks."""
         ...
 
     def map(
@@ -90,6 +95,10 @@ class InProcess:
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
 
+    def parts(self, shape: tuple[int, int, int]) -> list[slice]:
+        """Leave the planes of a volume together."""
+        return [slice(0, shape[0])]
+
     def map(
         self,
         task: Task[Item, Result],
@@ -125,8 +134,7 @@ def reconstruct_planes(
     stage : str
         What progress reports call it.
     """
-    places = executor.places
-    parts = equal_runs(shape[0], 1 if places == 1 else min(shape[0], PARTS * places))
+    parts = executor.parts(shape)
     if executor.folder is None:
         executor.map(_PlanesTask(work, target, threading.Lock()), parts, stage=stage)
         return
@@ -137,6 +145,39 @@ def reconstruct_planes(
         stage=stage,
         done=lambda number: files.hand_on(parts[number], target),
     )
+
+
+def slabs_of(
+    places: int, slab_bytes: float, shape: tuple[int, int, int], volumes: int = 1
+) -> list[slice]:
+    """Cut a volume into tasks: one slab a worker or more, none larger than its device takes.
+
+    More slabs would be read for more: on a helix most views see most of them.
+
+    Parameters
+    ----------
+    places : int
+        Workers.
+    slab_bytes : float
+        That the smallest device takes.
+    shape : (int, int, int)
+        Voxels (nz, ny, nx).
+    volumes : int
+        Slabs that a device holds at a time.
+
+    Raises
+    ------
+    ClusterError
+        If one plane is larger than that.
+    """
+    nz, ny, nx = shape
+    most = int(slab_bytes / volumes / (4 * ny * nx))
+    if most < 1:
+        raise ClusterError(
+            f"one plane of {ny} x {nx} voxels is more than the workers' devices take at once, "
+            f"{slab_bytes / volumes / 1024:.0f} KiB: use a coarser grid or raise the memory limits"
+        )
+    return equal_runs(nz, min(nz, max(places, -(-nz // most))))
 
 
 @dataclass(frozen=True)

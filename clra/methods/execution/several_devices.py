@@ -9,9 +9,9 @@ from typing import Any
 
 import pyopencl as cl
 
-from clra.methods.execution.executor import Item, Result, Task
+from clra.methods.execution.executor import PARTS, Item, Result, Task
 from clra.ops.streaming.memory import host_memory
-from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.stream import Stream, equal_runs
 from clra.progress import Progress, ProgressCallback
 
 # Steps of the progress that all devices make together.
@@ -49,6 +49,10 @@ class SeveralDevices:
         self._devices, self._progress = devices, progress
         self._device_memory = max_device_memory
         self._host_memory = (max_host_memory or host_memory() // 2) // len(devices)
+
+    def parts(self, shape: tuple[int, int, int]) -> list[slice]:
+        """Cut the planes of a volume (nz, ny, nx) into tasks, some for each device."""
+        return equal_runs(shape[0], min(shape[0], PARTS * self.places))
 
     def map(
         self,

@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from clra.errors import ClusterError
 from clra.methods.alignment.level import At, Level
 from clra.methods.alignment.reprojection import Registered, in_full_pixels
 from clra.methods.execution.checkpoint import Checkpoint
 from clra.methods.execution.clusters import on_cluster
 from clra.methods.execution.dask_cluster import DaskCluster
-from clra.methods.execution.executor import PARTS
+from clra.methods.execution.executor import PARTS, slabs_of
 from clra.methods.execution.level_tasks import (
     Bin,
     Measured,
@@ -27,7 +26,6 @@ from clra.methods.execution.level_tasks import (
 )
 from clra.methods.execution.travelling import Shared
 from clra.methods.truncation import extension
-from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.radiographs import Radiographs
@@ -71,7 +69,10 @@ class SharedLevel(Level):
         positive = self.solver.positive
         terms = self.terms if positive else 0
         planes = slabs_of(
-            self.cluster.places, self.cluster.slab_bytes, self.grid, planned_volumes(terms)
+            self.cluster.places,
+            self.cluster.slab_bytes,
+            self.grid.shape,
+            planned_volumes(terms),
         )
         options: dict[str, Any] = {
             "geometry": at.geometry,
@@ -172,32 +173,3 @@ def view_chunks(places: int, views: int) -> tuple[slice, ...]:
     """Cut views into tasks: some for each worker, none of many views."""
     count = max(PARTS * places, -(-views // _MOST_VIEWS))
     return tuple(equal_runs(views, min(views, count)))
-
-
-def slabs_of(places: int, slab_bytes: int, grid: VolumeGrid, volumes: int) -> list[slice]:
-    """Cut a volume into tasks: one slab a worker or more, none larger than its device takes.
-
-    Parameters
-    ----------
-    places : int
-        Workers.
-    slab_bytes : int
-        That the smallest device takes.
-    grid : VolumeGrid
-        Of the whole volume.
-    volumes : int
-        Slabs that a device holds at a time.
-
-    Raises
-    ------
-    ClusterError
-        If one plane is larger than that.
-    """
-    nz, ny, nx = grid.shape
-    most = slab_bytes // volumes // (4 * ny * nx)
-    if most < 1:
-        raise ClusterError(
-            f"one plane of {ny} x {nx} voxels is more than the workers' devices take at once, "
-            f"{slab_bytes // volumes >> 10} KiB: use a coarser grid or raise the memory limits"
-        )
-    return equal_runs(nz, min(nz, max(places, -(-nz // most))))

@@ -20,15 +20,13 @@ from clra.methods.reconstruction.imgr_state import ImgrStep
 from clra.methods.reconstruction.iterative import Options
 from clra.methods.reconstruction.katsevich import Exact, exact_helices
 from clra.methods.reconstruction.missing_views import without_gaps
+from clra.methods.reconstruction.scan_checks import warn_of_method, warn_of_scan
 from clra.methods.reconstruction.some_planes import SomePlanes
-from clra.methods.truncation import truncated
 from clra.model.binning import binned_motion, binned_scan
 from clra.model.corrections.correction_options import CorrectionOptions
-from clra.model.detector_pose import steep_rows
 from clra.model.grid import Region, VolumeGrid, volume_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
-from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
 from clra.model.validation import checked_valid_views
 from clra.ops.filtering.ramp import WINDOWS
@@ -273,7 +271,9 @@ def reconstruct_into(
         if motion is not None:
             motion = binned_motion(motion, binning, scan.geometry.shape)
         scan = small
-        _warn_of_scan(stream, scan, method)
+        warn_of_method(stream, scan, method)
+        if alignment is None and not align:
+            warn_of_scan(stream, scan, motion)
         if fitted is not None:
             there = scan.views if valid_views is None else int(valid_views.sum())
             _warn_of_gaps(fitted, grid, there)
@@ -289,19 +289,6 @@ def reconstruct_into(
     if own and keeping is not None and not cancelled(findings):
         keeping.clear()
     return Reconstruction(tuple(findings), steps, alignment)
-
-
-def _warn_of_scan(stream: Stream, scan: Scan, method: str) -> None:
-    """Warn of what a method makes less of than a scan's users may think."""
-    notes = {}
-    if method == "fbp":
-        notes["short-scan"] = part_of_a_turn(scan.geometry)
-        notes["cone-angle"] = steep_rows(scan.geometry)
-    if method != "katsevich":  # that refuses such samples
-        notes["truncation"] = truncated(Radiographs(stream, scan, 1), scan.geometry)
-    for code, note in notes.items():
-        if note:
-            Finding(code, note).warn()
 
 
 def _warn_of_gaps(fitted: Exact, grid: VolumeGrid, there: int) -> None:
