@@ -89,6 +89,10 @@ class KernelBuildError(DeviceError):
     """A kernel did not compile; the message carries the compiler's log."""
 
 
+class ClusterError(RuntimeError):
+    """A cluster did not do its work: it lost its workers or its scheduler, or a task failed."""
+
+
 class Cancelled(Exception):  # noqa: N818  (an answer to a callback, not a fault)
     """Raised by a progress callback to end a long call early, keeping what is finished."""
 

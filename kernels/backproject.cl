@@ -9,11 +9,11 @@
 //
 // Global size (nx, ny, ceil((top - bottom) / VOXELS)), rounded up at will.
 
-#include "gpu.clh"
-
 #ifndef VOXELS
 #define VOXELS 16
 #endif
+#include "voxels.clh"
+
 #ifndef INSIDE
 #define INSIDE 0 // 1 leaves the way with tests out, to count instructions
 #endif
@@ -38,16 +38,6 @@ always_inlined float on_detector(
     const float low = fma(h, image[next] - image[0], image[0]);
     const float high = fma(h, image[below + next] - image[below], image[below]);
     return fma(f, high - low, low);
-}
-
-// the sums of a work-item, of voxels `count` of which are in the volume
-always_inlined void
-put(global float *restrict target, const float *sum, const int count, const int accumulate)
-{
-#pragma unroll
-    for (int k = 0; k < VOXELS; ++k)
-        if (k < count)
-            target[k] = accumulate ? target[k] + sum[k] : sum[k];
 }
 
 // v is parallel to z.

@@ -2,10 +2,7 @@
 // volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
 // bilinearly at the voxel's projection, to zero over one row outside the detector.
 //
-// chi is 1 inside the Tam-Danielsson window, whose borders `window` gives by column, 0 outside. At
-// a border it falls linearly over as much as the projection moves from view to view, so that a
-// voxel's first and last view count by the part of them that belongs to its pi-interval, and one
-// row more, over which p is interpolated. weight shares voxels among helices, see pi_interval.clh.
+// chi and weight: see pi_interval.clh.
 //
 // The form for GPUs; CPUs run pi_backprojector_columns.cl. v is parallel to z: the voxels of a
 // column share g and the detector column, and row is linear in z. A work-item sums VOXELS voxels

@@ -1,15 +1,5 @@
-// pi_backprojector.cl for CPUs: back-projection over pi-intervals, for exact images from helices,
-// volume(i, j, k) = weight * sum over views of chi(row) p(column, row) / g, p interpolated
-// bilinearly at the voxel's projection.
-//
-// chi is 1 inside the Tam-Danielsson window, whose borders `window` gives by column, 0 outside. At
-// a border it falls linearly over as much as the projection moves from view to view, so that a
-// voxel's first and last view count by the part of them that belongs to its pi-interval, and one
-// row more, over which p is interpolated.
-//
-// weight shares voxels among helices. Of each, `spans` gives the heights above each (x, y) whose
-// pi-interval it holds; towards their ends its part falls linearly over BLEND voxels. Voxels that
-// no helix holds become 0.
+// pi_backprojector.cl for CPUs: the same sums over views, with the window and the parts of helices of
+// pi_interval.clh.
 //
 // v is parallel to z: the voxels of a column share g and the detector column, and row is linear in
 // z. A work-item sums BLOCK voxels along z over the given views. Global sizes are

@@ -41,6 +41,8 @@ Floats = NDArray[np.float64]
 # Displacement that no motion explains, and magnification, beyond which the reported geometry is
 # another scan's [pixel, factor].
 _BEYOND, _SCALED = 3.0, 1.2
+# Variance of the logarithm of a length whose two components are normal and alike in all views.
+_OF_EQUAL = np.pi**2 / 24
 
 
 def hopeless(case: Case) -> bool:
@@ -107,19 +109,32 @@ def _nothing(case: Case) -> clra.Motion:
 
 
 def _uncertainty(case: Case, result: Any) -> dict[str, float]:
-    """RMS error over RMS sigma, and the rank correlation of the two, in u, v and m."""
+    """RMS error over RMS sigma in u, v and m; how errors differ between views, and sigma with them.
+
+    Lengths of (u, v), each relative to its RMS. "differs" is the standard deviation of the
+    logarithm of what normal errors have beyond that of equal ones; it counts where some views'
+    errors are twice those of others. "rank" is the rank correlation of error and sigma.
+    """
     if hopeless(case):
         return {}
     free = differences(case, result.motion)[1]
     used = np.ones(case.scan.views, np.bool_)
     used[list(result.flagged)] = False
+    wrong, sigma = np.abs(free[used]), result.sigma[used, :3]
     measured = {}
+    known = np.isfinite(sigma).all(axis=0) & (sigma > 0).any(axis=0) & (wrong > 0).any(axis=0)
+    sizes = [np.sqrt(np.mean(table**2, axis=0)) for table in (wrong, sigma)]
     for axis, name in enumerate("uvm"):
-        sigma, wrong = result.sigma[used, axis], np.abs(free[used, axis])
-        if np.isfinite(sigma).all() and (sigma > 0).any():
-            ratio = np.sqrt(np.mean(wrong**2) / np.mean(sigma**2))
-            measured[f"ratio_{name}"] = float(ratio)
-            measured[f"rank_{name}"] = _rank_correlation(sigma, wrong)
+        if known[axis]:
+            measured[f"ratio_{name}"] = float(sizes[0][axis] / sizes[1][axis])
+    if known[:2].all():
+        lengths = [
+            np.hypot(*(table[:, :2] / size[:2]).T)
+            for table, size in zip((wrong, sigma), sizes, strict=True)
+        ]
+        beyond = np.var(np.log(np.maximum(lengths[0], 1e-9))) - _OF_EQUAL
+        measured["differs"] = float(np.sqrt(max(beyond, 0.0)))
+        measured["rank"] = _rank_correlation(*lengths)
     return measured
 
 

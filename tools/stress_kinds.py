@@ -17,6 +17,8 @@ from stress_scans import (
     apparent,
     counted,
     cylinder_points,
+    exposed,
+    flattened,
     phantom,
     radiographs,
 )
@@ -52,6 +54,10 @@ class Kind:
         Amplitude of a slow drift of the magnification.
     photons : float
         Of the open beam a pixel; 0 for no noise.
+    exposures : float
+        Longest exposure of a view over the shortest; `photons` is their geometric mean.
+    flat : float
+        Thickness of the sample along y, as a part of its width.
     wide : float
         Diameter of the sample in widths of the field of view; 0 for what fits with its motion.
     tall : float
@@ -85,6 +91,8 @@ class Kind:
     walk: float = 0.0
     scale: float = 0.0
     photons: float = 20000.0
+    exposures: float = 1.0
+    flat: float = 1.0
     wide: float = 0.0
     tall: float = 1.0
     wobble: float = 0.0
@@ -143,7 +151,7 @@ class Kind:
         far = float(np.quantile(np.abs(stage.shift), 0.98)) / size
         width = self.wide or 2 * max(0.25, min(0.42, 0.47 - far))
         height = shape_height(stage, self.tall)
-        body = phantom(self.sample, 0.5 * width, height, seed)
+        body = flattened(phantom(self.sample, 0.5 * width, height, seed), self.flat)
         points = cylinder_points(0.5 * min(width, 1.0), height)
         assumed = self.assumed(size)
         integrals = radiographs(stage, body).astype(np.float64)
@@ -151,7 +159,8 @@ class Kind:
         made: dict[str, Any] = {"pixels": integrals, "kind": "line-integrals"}
         if self.photons:
             # A dark pixel counts as half a photon.
-            pixels = np.maximum(counted(integrals, self.photons, seed), 0.5 / self.photons)
+            photons = exposed(self.photons, self.exposures, self.views, seed)
+            pixels = np.maximum(counted(integrals, photons, seed), 0.5 / photons)
             made = {"pixels": -np.log(pixels), "kind": "line-integrals"}
         scene = stress_defects.Scene(
             made["pixels"], made["kind"], reported, actual, seed, self.strength, assumed
@@ -216,13 +225,17 @@ def _kinds() -> dict[str, Kind]:
         kinds[f"jitter-{pixels}"] = replace(
             circle, jitter=float(pixels), causes=("large-motion", "truncation")
         )
-    kinds["drift-30"] = Kind(drift=(30.0, 10.0), causes=("large-motion", "truncation"))
+    large = ("large-motion", "truncation", "magnification")
+    kinds["drift-30"] = Kind(drift=(30.0, 10.0), causes=large)
     for views in (9, 21, 60, 240):
         kinds[f"still-{views}"] = Kind(views=views, causes=("few-views",))
     for views in (21, 30, 60):
         kinds[f"views-{views}"] = replace(circle, views=views, causes=("few-views",))
     for photons in (50, 200, 1000, 5000):
         kinds[f"photons-{photons}"] = replace(circle, photons=float(photons), causes=("noise",))
+    kinds["exposures"] = replace(circle, photons=200.0, exposures=100.0)
+    kinds["exposures-helix"] = replace(helix, photons=200.0, exposures=100.0)
+    kinds["plate"] = replace(circle, flat=0.25, sample="rock", photons=1000.0)
     for wide in (1.0, 1.2, 1.5, 2.0):
         kinds[f"wide-{wide}"] = replace(circle, wide=wide, sample="rock", causes=("truncation",))
     unmodelled = ("unmodelled-motion",)

@@ -230,7 +230,21 @@ def phantom(name: str, radius: float, height: float, seed: int) -> Ellipsoids:
     return Ellipsoids(centres, axes, weight)
 
 
-def counted(integrals: Floats, photons: float, seed: int) -> NDArray[np.float32]:
+def flattened(body: Ellipsoids, part: float) -> Ellipsoids:
+    """Squeeze a sample along y, and let it attenuate the more: as thick across, it is opaque."""
+    if part == 1:
+        return body
+    squeeze = np.array([1.0, part, 1.0])
+    return Ellipsoids(body.centres * squeeze, body.semi_axes * squeeze, body.attenuation / part)
+
+
+def exposed(photons: float, exposures: float, views: int, seed: int) -> Floats:
+    """Return the open beam's photons of each view, (views, 1, 1)."""
+    random = np.random.default_rng([seed, 9])
+    return np.asarray(photons * exposures ** random.uniform(-0.5, 0.5, (views, 1, 1)))
+
+
+def counted(integrals: Floats, photons: Floats, seed: int) -> NDArray[np.float32]:
     """Return transmissions of which each pixel's open beam has so many photons."""
     random = np.random.default_rng([seed, 3])
     return np.asarray(random.poisson(photons * np.exp(-integrals)) / photons, dtype=np.float32)

@@ -174,19 +174,20 @@ class Reading:
 
         return read_scanner(path, self._options())
 
-    def start_motion(self, path: Path, views: int) -> "Motion | None":
+    def start_motion(self, path: Path, scan: "Scan") -> "Motion | None":
         """Read a motion of a table, or that a scanner's software measured; None of other files."""
         from clra.io.motion_formats.motion_csv import is_motion_csv, read_motion_csv
         from clra.io.scanners.recognise import holds_start_motion, read_start_motion
 
         if is_motion_csv(path):
-            motion = read_motion_csv(path)[0]
-            if motion.views != views:
-                raise InputError.at(path, "view", f"{motion.views} views", f"{views} of the scan")
+            motion = read_motion_csv(path, scan.geometry)[0]
+            if motion.views != scan.views:
+                there = f"{scan.views} of the scan"
+                raise InputError.at(path, "view", f"{motion.views} views", there)
             return motion
         if not holds_start_motion(path):
             return None
-        return read_start_motion(path, views, self._options())
+        return read_start_motion(path, scan.views, self._options())
 
     def _options(self) -> "ScannerOptions":
         from clra.io.scanners.scanner_options import ScannerOptions

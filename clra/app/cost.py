@@ -142,7 +142,7 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
                 *([duration(cost.exact_s)] if helical else []),
             )
         )
-    lines = _columns(rows)
+    lines = columns(rows)
     if speed.budgets is None:
         return "\n".join(lines)
     budgets = speed.budgets
@@ -155,7 +155,7 @@ def costs_table(costs: Sequence[Cost], speed: Speed) -> str:
             f"Times are for {speed.device}, without reading the scan; an iteration is one of clra "
             "align.",
             "",
-            *_columns(_memory_rows(costs)),
+            *columns(_memory_rows(costs)),
             "",
             f"Memory at its peak, within {within} (--max-host-memory, --max-device-memory); what "
             "has no room goes to temporary files (TMPDIR).",
@@ -178,7 +178,8 @@ def _memory_rows(costs: Sequence[Cost]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Align the cells of each column to the right; return a line a row."""
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return ["  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
 

@@ -113,7 +113,7 @@ def _verdict(error: BaseException) -> tuple[int, str]:
             f"{first}: update the device's driver or choose another with --device "
             f"(clra devices lists them; {_DEBUG} shows the compiler's log)"
         )
-    if kind in ("DeviceError", "DeviceMemoryError", "OutputError"):
+    if kind in ("DeviceError", "DeviceMemoryError", "OutputError", "ClusterError"):
         return FAILED, str(error)
     if isinstance(error, OSError):
         return _of_system(error)

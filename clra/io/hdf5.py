@@ -58,6 +58,42 @@ def _open_reading(path: str | os.PathLike[str]) -> h5py.File:
         return h5py.File(path, "r", locking=False)
 
 
+class StoredArray:
+    """A data set that travels to another process as the path of its file and its name.
+
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+        Open for reading.
+
+    Attributes
+    ----------
+    shape, dtype, name
+        Of the data set.
+    """
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self.shape: tuple[int, ...] = dataset.shape
+        self.dtype = dataset.dtype
+        self.name: str = dataset.name
+
+    def __len__(self) -> int:
+        """Return the length of the first axis."""
+        return self.shape[0]
+
+    def __getitem__(self, index: Any) -> Any:
+        """Read a part."""
+        return self._dataset[index]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _stored, (os.path.abspath(self._dataset.file.filename), self.name)
+
+
+def _stored(path: str, name: str) -> StoredArray:
+    return StoredArray(require(open_hdf5(path), name, "what was read from it elsewhere"))
+
+
 def find(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     """Return what `name` leads to below `group`, or None where there is nothing.
 

@@ -22,6 +22,7 @@ from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.detector_pose import reversed_axes
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import default_grid
+from clra.model.motion import Motion
 from clra.model.rotation_sense import opposite_rotation
 from clra.model.sampling.angular_coverage import covered, fan_angle
 from clra.model.scan import Scan
@@ -47,6 +48,11 @@ _SHARPER = 1.05
 # Fan below which radiographs may fit the wrong sense so well that it takes the slices to tell. With
 # 18 degrees a third of a held-out radiograph is not predicted by the wrong one.
 _NARROW = math.radians(12.0)
+# Part of the detector by which views have to move to be told as a cause: motions of a quarter of it
+# are often found well.
+_LARGE = 0.15
+# Findings that are worth knowing in a good result, and the cause of a bad one.
+_CAUSES = ("limited-arc", "few-views", "axial-truncation")
 # Parts of the columns by which the axis may be elsewhere.
 _OFFSETS = (0.02, 0.04, 0.07, 0.12, 0.25, 0.375)
 
@@ -144,7 +150,35 @@ def evidence(
         other = doubted_rotation(sharper) if sharper == sharper else None
     if other is not None:
         quality = replace(quality, verdict="failed", reasons=(other, *quality.reasons))
-    return replace(aligned, quality=quality), [*quality.reasons, *findings]
+    if quality.verdict != "good":
+        findings = [replace(f, severity="warning") if f.code in _CAUSES else f for f in findings]
+        findings += [f for f in [large_motion(aligned.motion, scan.geometry)] if f is not None]
+    others = [finding for finding in findings if finding not in quality.reasons]
+    return replace(aligned, quality=quality), [*quality.reasons, *others]
+
+
+def large_motion(motion: Motion, geometry: ConeBeamGeometry) -> Finding | None:
+    """Return a finding if views moved so far that parts of the sample left the detector.
+
+    Parameters
+    ----------
+    motion : Motion
+        As found.
+    geometry : ConeBeamGeometry
+        Of the same views.
+    """
+    sizes = zip((motion.shift_u, motion.shift_v), geometry.shape[::-1], strict=True)
+    parts = [float(np.quantile(np.abs(shift), 0.98)) / pixels for shift, pixels in sizes]
+    if max(parts) < _LARGE:
+        return None
+    return Finding(
+        "large-motion",
+        f"radiographs moved by up to {100 * parts[0]:.0f} % of the detector's width and "
+        f"{100 * parts[1]:.0f} % of its height: what left it is missing, and movements of the "
+        "sample as a whole are not small any more",
+        "correct what is known of the motion before (--start), or take a smaller sample",
+        measured={"part_u": parts[0], "part_v": parts[1]},
+    )
 
 
 def doubted_rotation(sharpening: float) -> Finding | None:
@@ -187,7 +221,7 @@ def _unexplained(
         detector=hidden.geometry.shape,
         stage="looking for a better geometry",
     )
-    return float(np.median(np.sqrt(1 - np.clip(registered.correlation, 0, 1) ** 2)))
+    return float(np.median(registered.unexplained))
 
 
 def _hypotheses(geometry: ConeBeamGeometry) -> Iterator[_Hypothesis]:

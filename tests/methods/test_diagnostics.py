@@ -5,7 +5,7 @@ import pytest
 
 import clra
 from clra.app.simulation import sample, simulated_scan
-from clra.methods.diagnostics import contradicted_geometry, doubted_rotation
+from clra.methods.diagnostics import contradicted_geometry, doubted_rotation, large_motion
 from clra.ops.streaming.stream import Stream
 
 VIEWS, SHAPE = 72, (48, 64)
@@ -67,3 +67,11 @@ def test_the_sense_of_rotation_is_doubted_where_the_other_is_sharper(sharpening,
     found = doubted_rotation(sharpening)
     assert (found is not None) == doubted
     assert found is None or ("1.30" in str(found) and "--rotation" in str(found))
+
+
+def test_motions_as_large_as_the_detector_are_named():
+    wave = np.sin(np.linspace(0, 6, VIEWS))
+    found = large_motion(clra.Motion(shift_u=20 * wave, shift_v=2 * wave), helix())
+    assert found is not None and found.code == "large-motion"
+    assert float(found.measured["part_u"]) == pytest.approx(20 / SHAPE[1], rel=0.02)
+    assert large_motion(clra.Motion(shift_u=5 * wave, shift_v=2 * wave), helix()) is None

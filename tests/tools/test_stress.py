@@ -108,11 +108,11 @@ def test_a_perfect_result_scores_nothing(tool, stress, tmp_path, capsys):
 def test_verdicts_are_added_up(tool):
     right = {"kind": "a", "seed": 1, "causes": ["x"], "error": 0.05, "codes": [], "verdict": "good"}
     wrong = {"kind": "b", "seed": 1, "causes": ["x"], "codes": ["y"], "verdict": "failed"}
-    more = {"ratio_u": 1.0, "rank_u": 0.6}
+    more = {"ratio_u": 1.0, "rank": 0.6, "differs": 0.5}
     told = tool("stress_table").conclusions(
         [
             {**right, **more},
-            {**right, "verdict": "doubtful", "ratio_u": 3.0, "rank_u": 0.2},
+            {**right, "verdict": "doubtful", "ratio_u": 3.0, "rank": 0.2, "differs": 0.1},
             wrong,
             {**wrong, "codes": ["x"]},
             {**wrong, "error": 0.7, "verdict": "good"},
@@ -120,6 +120,23 @@ def test_verdicts_are_added_up(tool):
     )
     assert "Of 3 with an error above 0.5 pixel 2 are doubtful" in told
     assert "the right cause is named in 1; of 2 with one below 0.15 pixel 1 are." in told
-    assert (
-        "in u: 2.00 (median), within 0.5 and 2 in 1 of 2; rank correlation of the two 0.40" in told
-    )
+    assert "in u: 2.00 (median), within 0.5 and 2 in 1 of 2." in told
+    # Where all views' errors are alike, there is nothing to rank.
+    assert "differ between views: 1; rank correlation with sigma 0.60 (median)" in told
+
+
+def test_error_bars_rank_views_only_where_their_errors_differ(tool, stress):
+    case = tool("stress_kinds").KINDS["circle-240"].case(1, 32)
+    random = np.random.default_rng(4)
+    spread = np.exp(random.normal(0, 0.7, case.scan.views))
+    found = {}
+    for name, size in (("equal", np.ones(case.scan.views)), ("differing", spread)):
+        wrong = 0.01 * size[:, None] * random.normal(size=(case.scan.views, 2))
+        u, v, m = case.truth.values.T
+        motion = clra.Motion(shift_u=u + wrong[:, 0], shift_v=v + wrong[:, 1], magnification=m)
+        result = clra.AlignmentResult.from_motion(motion)
+        sigma = 0.01 * np.stack([spread, spread, 0 * spread], axis=1)
+        found[name] = stress._uncertainty(case, replace(result, sigma=sigma))
+    assert found["equal"]["differs"] < 0.4 < found["differing"]["differs"]
+    assert abs(found["equal"]["rank"]) < 0.2
+    assert found["differing"]["rank"] > 0.5

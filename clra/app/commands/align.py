@@ -8,6 +8,7 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.app.correcting import Correcting
+from clra.app.planning.cluster_option import Cluster
 from clra.errors import InputError
 
 
@@ -56,7 +57,8 @@ def align(
         typer.Option(
             metavar="TEXT",
             help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
-            "auto: 6ER-3QR on large detectors, else QR until converged; then HR until converged. "
+            "auto: 6ER-3QR on large detectors, else QR until converged; then HR until converged; "
+            "before it a pre-alignment (PA) where the motion is large or the beam parallel. "
             "With imgr the levels of a cycle: QR-HR-FR.",
         ),
     ] = "auto",
@@ -78,6 +80,7 @@ def align(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where this command was interrupted.")
     ] = False,
+    cluster: Cluster = None,
     report: Annotated[
         Path | None, typer.Option(metavar="REPORT.html", help="Write a report as well.")
     ] = None,
@@ -104,6 +107,7 @@ def align(
       clra align scan.nxs -o motion.h5 --reference quick.nxs
       clra align scan.nxs -o drift.h5 --reference quick.nxs --method reference
       clra align scan.nxs -o motion.h5 --autofocus
+      clra align scan.nxs -o motion.h5 --cluster tcp://node1:8786
     """
     from clra.app.annotations import annotated, focus_attributes, matched
     from clra.app.arguments import volume_file
@@ -141,7 +145,7 @@ def align(
             kept.append(path)
     opened = reading.scan(scan)
     still = None if reference is None else reading.scan(reference)
-    measured = None if start is None else reading.start_motion(start, opened.views)
+    measured = None if start is None else reading.start_motion(start, opened)
     earlier = None if start is None or measured is not None else read_alignment(start)
     if earlier is not None and start is not None:
         opened = matched(opened, earlier, start, reading.geometry())
@@ -172,6 +176,7 @@ def align(
                 device=console.device,
                 progress=progress,
                 checkpoint=checkpoint,
+                cluster=cluster,
                 **limits,
             )
         except AlignmentInterrupted as stopped:

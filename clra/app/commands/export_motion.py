@@ -30,7 +30,8 @@ def export_motion(
     astra: vectors of cone_vec, .npy. rtk: geometry, .xml. cil, tigre: arrays by name, .npz. These
     describe where source and detector were, with the motion. nabu: translation_movements_file.
     imod: .xf, which aligns the images. csv: shifts towards higher columns and rows in pixels, and
-    magnifications; clra align --start reads it.
+    magnifications; clra align --start reads it. Rotations of the sample are for astra, rtk, cil
+    and csv.
 
     Examples
     --------

@@ -1,12 +1,28 @@
 """Describe a scan and what it will take."""
 
+from typing import Annotated
+
+import typer
+
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.app.correcting import Correcting
 from clra.findings import warn
 
 
 def info(
-    console: Console, reading: Reading, memory: Memory, correcting: Correcting, scan: ScanPath
+    console: Console,
+    reading: Reading,
+    memory: Memory,
+    correcting: Correcting,
+    scan: ScanPath,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|local:N|NxGPU",
+            help="Also plan the work of N workers with devices like this one, of N processes here, "
+            "or of N workers with a GPU.",
+        ),
+    ] = None,
 ) -> None:
     """Describe a scan and what it will take.
 
@@ -20,8 +36,12 @@ def info(
       clra info scan.nxs
       clra info scan.nxs --json
       clra info Lego.xtekct
+      clra info scan.nxs --cluster 8xGPU
     """
     from clra.app.cost import costs_of, costs_table
+    from clra.app.planning.cluster_plan import plans
+    from clra.app.planning.plan_table import plan_table
+    from clra.app.planning.planned_steps import Workers
     from clra.app.scan_description import Facts, scanner_text, table
     from clra.app.speed import Speed, measure
     from clra.errors import DeviceError
@@ -47,6 +67,10 @@ def info(
     told = "" if scanner is None else f"\n\n{scanner_text(scanner)}"
     text = f"{table(facts.lines())}{told}\n\n{costs_table(costs, speed)}"
     values = {"scan": facts, "device": speed.device, "levels": costs}
+    if cluster is not None:
+        planned = plans(opened.geometry, Workers.parse(cluster, speed))
+        values["cluster"] = planned
+        text += f"\n\n{plan_table(planned, Workers.parse(cluster, speed))}"
     if scanner is not None:
         values["scanner"] = {
             **scanner.contents(),

@@ -8,6 +8,7 @@ import typer
 
 from clra.app.console import Console, Memory, Reading
 from clra.app.correcting import Correcting
+from clra.app.planning.cluster_option import Cluster
 from clra.errors import InputError
 
 if TYPE_CHECKING:
@@ -172,6 +173,7 @@ def reconstruct(
             "--align", help="Align the scan first, as clra align would; imgr does it on the way."
         ),
     ] = False,
+    cluster: Cluster = None,
 ) -> None:
     """Reconstruct a volume.
 
@@ -188,6 +190,7 @@ def reconstruct(
       clra reconstruct helix.nxs -o volume.h5 --method katsevich --align
       clra reconstruct scan.nxs -o volume.h5 --method imgr --align
       clra reconstruct noisy.nxs -o volume.h5 --method osem-tr --i0 4000 --passes 2
+      clra reconstruct scan.nxs -o volume.h5 --motion motion.h5 --cluster local:4
     """
     from clra.app.annotations import alignment_for
     from clra.app.arguments import volume_file
@@ -255,6 +258,7 @@ def reconstruct(
                 corrections=correcting.options(),
                 progress=progress,
                 checkpoint=checkpoint,
+                cluster=cluster,
                 **sampled,
                 **limits,
             )

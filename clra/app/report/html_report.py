@@ -16,7 +16,9 @@ from clra.app.report.verdict_box import verdict_box
 from clra.app.scan_description import listed
 from clra.io.atomic import atomic_path
 from clra.methods.alignment.result import Iteration
+from clra.methods.alignment.rigid.rigid_parts import rigid_parts
 from clra.methods.assessment.agreement import Agreement
+from clra.model.rigid.rigid_motion import RigidMotion
 
 _COMPONENTS = {"u": ".3f", "v": ".3f", "magnification": ".1e"}  # of an error, as told
 _UNOBSERVABLE = {
@@ -60,6 +62,7 @@ def render(findings: Findings) -> str:
         page.cards(_cards(findings)),
         *before_and_after(findings.comparison),
         _corrections(findings),
+        *([_rigid(findings)] if isinstance(result.motion, RigidMotion) else []),
         *([_errors(findings.errors, findings.angles)] if findings.errors else []),
         _trust(findings),
         *([_history(result.history)] if result.history else []),
@@ -120,6 +123,24 @@ def _corrections(findings: Findings) -> str:
     return page.section(
         "Correction of each radiograph",
         view_charts.corrections(result.motion, findings.angles, returns=returns),
+    )
+
+
+def _rigid(findings: Findings) -> str:
+    motion = findings.result.motion
+    assert isinstance(motion, RigidMotion)
+    rows = [
+        [name, *(f"{value:.3g}" if np.isfinite(value) else "" for value in part)]
+        for name, part in rigid_parts(findings.result).items()
+    ]
+    return page.section(
+        "Motion of the sample",
+        view_charts.rigid_motion(motion, findings.angles),
+        page.folded(
+            "Numbers of the six parts",
+            page.table(["", "rms", "largest", "standard error"], rows),
+            shown=True,
+        ),
     )
 
 

@@ -1,5 +1,6 @@
 """What there is to tell of an alignment: errors against a known truth, pictures, a summary."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -12,8 +13,10 @@ from clra.app.progress_bar import duration
 from clra.app.scan_description import Facts, table, views_flagged
 from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.alignment.rigid.rigid_parts import rigid_parts
 from clra.methods.assessment.quality import Quality
 from clra.model.gauge.gauge import Gauge, sample_points
+from clra.model.gauge.modes import GAUGE_MODES
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -230,8 +233,20 @@ def summary_of(result: AlignmentResult, errors: Errors | None) -> tuple[dict[str
         "magnification": f"{least:.5f} to {most:.5f}",
         "confidence": f"median {np.median(confidence):.3f}, {views_flagged(result.flagged)}",
     }
+    parts = rigid_parts(result)
+    if parts:
+        values["rigid"] = {
+            name.replace("\u00b5", "u"): dict(zip(("rms", "largest", "sigma"), part, strict=True))
+            for name, part in parts.items()
+        }
+        turned = [part[0] for name, part in parts.items() if "degree" in name]
+        lines["rotation"] = (
+            f"{', '.join(f'{angle:.3f}' for angle in turned)} degrees rms about u, v, the beam"
+        )
     if result.gauge:
         lines["unobservable"] = _unobservable(result)
+    if isinstance(judged, Quality):
+        lines |= _hardly_determined(judged)
     if "detector_offset_u" in result.about:
         offset, tilt = (result.about[name] for name in ("detector_offset_u", "detector_tilt"))
         values |= {"detector_offset_u": offset, "detector_tilt": tilt}
@@ -257,6 +272,19 @@ def _verdict(quality: Quality) -> str:
         f"{quality.verdict}; expected error {quality.error:.2f} pixel; {after:.1f} % of a held-out "
         f"radiograph not predicted, {before:.1f} % at the start"
     )
+
+
+def _hardly_determined(quality: Quality) -> dict[str, str]:
+    """Tell modes that held-out views hardly see, other than movements of the sample."""
+    modes = [m for m in quality.modes if m.hardly_determined and m.name not in GAUGE_MODES]
+    if not modes:
+        return {}
+    told = (
+        f"{m.name} {m.amplitude:.2f}"
+        + (f" +- {m.sigma:.2f}" if math.isfinite(m.sigma) else ", not determined")
+        for m in modes
+    )
+    return {"hardly determined": f"{'; '.join(told)} pixel rms"}
 
 
 def _unobservable(result: AlignmentResult) -> str:

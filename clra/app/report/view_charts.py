@@ -8,6 +8,7 @@ from clra.app.report.charts import Curve, captioned, chart
 from clra.app.report.figures import FAINT, SCALE, WARN, U, V
 from clra.app.report.summary import Errors, Floats
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 
 _RETURNS = " Errors of the stage come mirrored about the middle, where it turns back."
 
@@ -37,6 +38,38 @@ def corrections(motion: Motion, angles: Floats | None, *, returns: bool = False)
         "geometry puts it: the inverse of the estimated motion. Positive u is toward higher "
         "columns, positive v toward higher rows; in pixels of the full detector."
         + (_RETURNS if returns else ""),
+    )
+
+
+def rigid_motion(motion: RigidMotion, angles: Floats | None) -> str:
+    """Draw translations and rotations that the sample made.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+        As estimated.
+    angles : ndarray, (views,), optional
+        Of the views [degree].
+    """
+    axes = (("u", U), ("v", V), ("beam", SCALE))
+    um, degrees = 1e3 * motion.translation, np.degrees(motion.rotation)
+    near, per_u = np.median(motion.optics[:, :2], axis=0)
+    return captioned(
+        [
+            chart(
+                title,
+                label,
+                [Curve(n, c, v) for (n, c), v in zip(axes, table.T, strict=True)],
+                angles=angles,
+            )
+            for title, label, table in (
+                ("Translation", "along the axis [\u00b5m at the sample]", um),
+                ("Rotation", "about the axis [degree]", degrees),
+            )
+        ],
+        "How the sample moved and turned, in the axes of each view: u toward higher columns, v "
+        "toward higher rows, the beam toward the detector. At the depth of the rotation axis one "
+        f"pixel of the detector is {1e3 * near / per_u:.3g} \u00b5m of the sample.",
     )
 
 

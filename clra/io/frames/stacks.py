@@ -131,6 +131,13 @@ class FrameStack:
                 out[k] = self._current.read(frame - int(self._ends[which - 1] if which else 0))
         return out
 
+    def __getstate__(self) -> dict[str, Any]:
+        files = tuple(path.absolute() for path in self.files)
+        return {**self.__dict__, "files": files, "_current": None, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= {**state, "_lock": Lock()}
+
     def close(self) -> None:
         """Close the file that was read last."""
         if self._current is not None:

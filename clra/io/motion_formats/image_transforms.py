@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import InputError
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +30,13 @@ def nabu_translations(motion: Motion, *, cone: bool) -> Floats:
     -------
     ndarray, (views, 2)
         Horizontal and vertical [pixel].
+
+    Raises
+    ------
+    InputError
+        If the sample turned: no shift of a radiograph shows that.
     """
+    motion = _of_images(motion, "nabu's translations")
     across = -motion.shift_u if cone else motion.shift_u
     return np.stack([across, motion.shift_v], axis=1)
 
@@ -48,7 +56,24 @@ def imod_transforms(motion: Motion) -> Floats:
     -------
     ndarray, (views, 6)
         A11, A12, A21, A22, DX, DY, the latter two in pixels.
+
+    Raises
+    ------
+    InputError
+        If the sample turned: no shift of a radiograph shows that.
     """
-    inverse = motion.inverse()
+    inverse = _of_images(motion, "IMOD's transforms").inverse()
     m, zero = inverse.magnification, np.zeros(motion.views)
     return np.stack([m, zero, zero, m, inverse.shift_u, -inverse.shift_v], axis=1)
+
+
+def _of_images(motion: Motion, what: str) -> Motion:
+    """Return the shifts and magnifications of a motion without rotations."""
+    if not isinstance(motion, RigidMotion):
+        return motion
+    if motion.rotation.any():
+        raise InputError(
+            f"motion: found rotations of the sample, expected shifts for {what}; 'astra', 'rtk', "
+            "'cil' and 'csv' express them"
+        )
+    return motion.caused_by("detector")

@@ -45,7 +45,8 @@ def export_motion(
         translations, "imod": transforms that align the images, both as text, see
         :mod:`clra.io.motion_formats.image_transforms`. "csv": a table.
     motion : Motion
-        As aligned.
+        As aligned. "astra", "cil", "rtk" and "csv" express any rigid motion of the sample; "nabu"
+        and "imod" no rotation, "tigre" only those about z.
     geometry : ConeBeamGeometry, optional
         Of the scan, without the motion; all but "csv" and "imod" need it.
     valid_views : ndarray of bool, (views,), optional

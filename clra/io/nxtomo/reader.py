@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.io.frames.counts import CountedRadiographs
-from clra.io.hdf5 import find, numbers, open_hdf5, require, text
+from clra.io.hdf5 import StoredArray, find, numbers, open_hdf5, require, text
 from clra.io.nxtomo.clra_group import KIND_ATTRIBUTE, KINDS, read_mask, read_truth, read_vectors
 from clra.io.nxtomo.entry import scan_detector, scan_entry
 from clra.io.nxtomo.fields import Overrides, read_fields
@@ -65,7 +65,7 @@ def read_nxtomo(
         where = f"{frames.name}@{KIND_ATTRIBUTE}"
         raise InputError.at(file.filename, where, repr(kind), f"one of {KINDS}")
     projections = CountedRadiographs(
-        frames,
+        StoredArray(frames),
         path=os.fspath(path),
         views=views,
         flats=flats,

@@ -19,8 +19,8 @@ import numpy as np
 
 from clra.errors import InputError
 from clra.findings import Finding
+from clra.io.hdf5 import StoredArray, find, lengths, open_hdf5, require, text
 from clra.io.hdf5 import angles as read_angles
-from clra.io.hdf5 import find, lengths, open_hdf5, require, text
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import (
     ScannerScan,
@@ -106,7 +106,7 @@ def read_dxchange(path: Path, options: ScannerOptions) -> ScannerScan:
         format="Data Exchange",
         path=path,
         geometry=geometry,
-        frames=frames,
+        frames=StoredArray(frames),
         kind="counts",
         flats=_others(file, "exchange/data_white", shape),
         darks=_others(file, "exchange/data_dark", shape),
@@ -133,7 +133,7 @@ def _pixel(
     return 1e-3, 1e-3
 
 
-def _others(file: h5py.File, name: str, shape: tuple[int, int]) -> h5py.Dataset | None:
+def _others(file: h5py.File, name: str, shape: tuple[int, int]) -> StoredArray | None:
     """Frames without the sample, or None where there are none."""
     dataset = find(file, name)
     if not isinstance(dataset, h5py.Dataset) or not dataset.size:
@@ -141,7 +141,7 @@ def _others(file: h5py.File, name: str, shape: tuple[int, int]) -> h5py.Dataset 
     if dataset.ndim != 3 or dataset.shape[1:] != shape:
         expected = f"(n, {shape[0]}, {shape[1]})"
         raise InputError.at(file.filename, dataset.name, f"shape {dataset.shape}", expected)
-    return dataset
+    return StoredArray(dataset)
 
 
 def _details(file: h5py.File) -> dict[str, str]:

@@ -90,6 +90,9 @@ class TxrmFile:
             raise InputError.at(path, "ImageInfo/DataType", code, expected)
         self.dtype = np.dtype(_TYPES[code])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return TxrmFile, (self.path.absolute(),)
+
     def __getitem__(self, index: slice) -> NDArray[Any]:
         """Read some consecutive radiographs."""
         chosen = range(*index.indices(self.shape[0]))

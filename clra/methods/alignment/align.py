@@ -10,18 +10,29 @@ from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
-from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, finished
+from clra.methods.alignment.rigid.held_out_errors import with_standard_errors
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
-from clra.methods.assessment.quality import assess
+from clra.methods.alignment.rigid.rigid_start import RigidStart
+from clra.methods.assessment.assess import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
-from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.execution.checkpoint import (
+    Checkpoint,
+    Saved,
+    cancelled,
+    checkpoint_of,
+    identity,
+)
+from clra.methods.execution.choice import check_for_cluster
+from clra.methods.execution.shared_level import levels_on
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
 from clra.ops.runtime.versions import versions
@@ -56,6 +67,7 @@ def align(
     max_host_memory: int | None = None,
     corrections: CorrectionOptions | None = None,
     quality: bool = True,
+    cluster: Any = None,
 ) -> AlignmentResult:
     """Estimate how each radiograph moved.
 
@@ -71,6 +83,10 @@ def align(
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
         detector of 384 pixels and more "6ER-3QR", else a quarter of the resolution
         until converged (at most 20 iterations), then half until converged (at most 3, often one).
+        Where the motion is large, or the views are an arc of a parallel beam, "auto" begins with
+        shifts by sums over the radiographs ("PA" in the history), and on other arcs with the column
+        of the axis, if the rays that are measured twice tell one; ``Solver(prealign=False)``
+        leaves both out.
         For "imgr" the levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source", "rigid", "shift+roll", "shift+scale+roll"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the
@@ -87,7 +103,8 @@ def align(
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.
     motion : Motion, optional
-        Where to start; by default no motion. What it has of the gauge stays.
+        Where to start; by default no motion. What it has of the gauge stays. After a rigid one the
+        result is rigid, whatever is estimated.
     truth : Motion, optional
         To report errors against; by default the scan's own, if it is a simulated one.
     progress : callable, optional
@@ -111,6 +128,10 @@ def align(
     quality : bool
         Whether to judge the result by views that are held out: a verdict, and standard errors that
         count what is left. A motion that predicts them no better than the start is not returned.
+    cluster : distributed.Client or str, optional
+        Workers that reconstruct, project and register for "ra", but for `estimate` "rigid" and
+        those with a roll: a client of Dask, or "local:N", "slurm:N", the address of a scheduler or
+        its file. The scan has to be in a file. What is left for the device here is small.
 
     Returns
     -------
@@ -133,6 +154,10 @@ def align(
        Algorithms 1, 2 and 3.
     """
     _check(scan, method, estimate, gauge)
+    if estimate == "source" and isinstance(motion, RigidMotion):
+        raise InputError("motion: found a rigid one with estimate='source', expected shifts")
+    check_for_cluster(cluster, scan, method, ("ra",))
+    check_for_cluster(cluster, scan, estimate, [e for e in ESTIMATES if e not in FREE])
     keeping, own = checkpoint_of(checkpoint, resume)
     stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
@@ -148,13 +173,15 @@ def align(
         report=progress,
     )
     anchor = gauge == "anchored" and method != "reference"
+    begun: RigidStart | None = None
 
     def told(result: AlignmentResult) -> AlignmentResult:
         """Add what is known of any run, for the whole detector."""
         offset_u, offset_v = scan.window_offset
+        found = result.motion if begun is None else begun.followed_by(result.motion)
         return replace(
             result,
-            motion=result.motion.about(-offset_u, -offset_v),
+            motion=found.about(-offset_u, -offset_v),
             warnings=tuple(findings),
             method=method,
             estimate=estimate,
@@ -176,6 +203,11 @@ def align(
         motion = None if motion is None else motion.about(*scan.window_offset)
         truth = scan.truth if truth is None else truth
         truth = None if truth is None else truth.about(*scan.window_offset)
+        own_grid = grid is None
+        grid = grid or default_grid(part.geometry)
+        if isinstance(motion, RigidMotion):
+            begun = RigidStart.of(part, motion)
+            part, motion, truth = begun.scan, None, None
         if reference is not None:
             if reference.geometry.shape == scan.geometry.shape:
                 reference = with_detector_of(scan, reference).cropped()
@@ -185,8 +217,6 @@ def align(
             motion = drift.motion
         start = motion or Motion.identity(scan.views)
         start = start.caused_by("source" if estimate == "source" else "detector")
-        own_grid = grid is None
-        grid = grid or default_grid(part.geometry)
         solver = solver or Solver()
         scale = scale and solver.estimator == "gauss-newton"
         saved = None
@@ -223,11 +253,26 @@ def align(
                     truth,
                     keeping,
                 )
-                run.align(stages, saved)
+                limits = {
+                    "max_device_memory": max_device_memory,
+                    "max_host_memory": max_host_memory,
+                }
+                with levels_on(cluster, part, keeping, progress, limits) as run.make_level:
+                    run.align(stages, saved)
                 aligned = run.result()
                 if estimate in FREE and not cancelled(findings):
-                    rigid = RigidAlignment(stream, part, region, solver, estimate, aligned, anchor)
-                    aligned = _turned(rigid, aligned)
+                    rigid = RigidAlignment(
+                        stream,
+                        part,
+                        region,
+                        solver,
+                        estimate,
+                        aligned,
+                        anchor,
+                        keeping,
+                        run.state(),
+                    )
+                    aligned = _turned(rigid, saved)
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
@@ -240,15 +285,16 @@ def align(
     return result
 
 
-def _turned(rigid: RigidAlignment, shifts: AlignmentResult) -> AlignmentResult:
-    """Go on with a rigid motion; the shifts alone stay if the call is ended."""
+def _turned(rigid: RigidAlignment, saved: Saved | None) -> AlignmentResult:
+    """Go on with a rigid motion; what is finished stays if the call is ended."""
     try:
-        return rigid.align()
+        return rigid.align(saved)
     except Cancelled:
-        Finding("cancelled", "the alignment was ended early, with the shifts alone").warn()
-        return shifts
+        done = finished(rigid.done.history)
+        Finding("cancelled", f"the alignment was ended early, after {done}").warn()
+        return rigid.result()
     except KeyboardInterrupt:
-        raise AlignmentInterrupted(shifts) from None
+        raise AlignmentInterrupted(rigid.result()) from None
 
 
 def _judged(
@@ -257,7 +303,8 @@ def _judged(
     """Add a verdict and findings, unless the call is ended or there is not enough to judge by."""
     try:
         if aligned.valid_views.sum() >= _ENOUGH_TO_JUDGE:
-            aligned = assess(stream, scan, aligned, start, scale=scale)
+            judged = assess(stream, scan, aligned, start, scale=scale)
+            aligned = with_standard_errors(stream, scan, aligned, judged, scale=scale)
         return evidence(stream, scan, aligned)
     except (Cancelled, DeviceMemoryError):
         return aligned, []  # which is finished
@@ -281,6 +328,8 @@ def _check(scan: Scan, method: str, estimate: str, gauge: str) -> None:
         raise InputError(f"method: found {method!r}, expected one of {METHODS}")
     if estimate not in ESTIMATES:
         raise InputError(f"estimate: found {estimate!r}, expected one of {ESTIMATES}")
+    if estimate in FREE and method != "ra":
+        raise InputError(f"estimate: found {estimate!r} with method {method!r}, expected 'ra'")
     if gauge not in GAUGES:
         raise InputError(f"gauge: found {gauge!r}, expected one of {GAUGES}")
     if scan.views < 2:

@@ -9,7 +9,7 @@ is left.
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,18 +20,29 @@ from clra.findings import Finding
 from clra.methods.alignment.level import Level
 from clra.methods.alignment.limits import false_shifts, far_motion, lost_features, warned
 from clra.methods.alignment.options import Solver
+from clra.methods.alignment.prealignment.axis_column import axis_column
+from clra.methods.alignment.prealignment.prealignment import Prealignment, is_open, prealigned
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import Rejections
 from clra.methods.alignment.reprojection import Registered
-from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, Iteration, finished
+from clra.methods.alignment.result import (
+    PREALIGNED,
+    AlignmentInterrupted,
+    AlignmentResult,
+    Iteration,
+    finished,
+)
 from clra.methods.alignment.steps.acceleration import MotionSteps
 from clra.methods.alignment.steps.slow_modes import SlowSteps, held
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
+    State,
     history_from,
     history_values,
     motion_arrays,
     motion_from,
+    prealigned_arrays,
+    prealigned_from,
     registered_arrays,
     registered_from,
 )
@@ -72,6 +83,8 @@ class CoarseToFine:
         To report errors against.
     checkpoint : Checkpoint, optional
         Keeps each finished iteration.
+    make_level : callable
+        Makes a :class:`Level` of its first five arguments.
     """
 
     stream: Stream
@@ -84,21 +97,25 @@ class CoarseToFine:
     start: Motion
     truth: Motion | None = None
     checkpoint: Checkpoint | None = None
+    make_level: Callable[[Stream, Scan, Region, Solver, int], Level] = Level
     several: bool = field(init=False)  # iterations in the schedule
     motion: Motion = field(init=False)
+    origin: Motion = field(init=False)  # whose gauge stays
     history: list[Iteration] = field(init=False, default_factory=list)
-    registered: Registered = field(init=False)
+    prealigned: Prealignment | None = field(init=False, default=None)
+    registered: Registered | None = field(init=False, default=None)  # by the last iteration
     found: Motion = field(init=False)  # by the last iteration, with its gauge
     last: tuple[int, Floats] = field(init=False)  # its level, and updates of valid views
     fresh: bool = field(init=False)  # nothing was known of the motion before it
     steps: MotionSteps = field(init=False)  # of the level
     rejected: NDArray[np.bool_] = field(init=False)
     rejections: Rejections = field(init=False)
+    position: tuple[int, int] = field(init=False, default=(0, 0))  # stage, iterations of it
 
     def __post_init__(self) -> None:
         excluded = () if self.scan.corrections is None else self.scan.corrections.excluded
         self.rejections = Rejections(self.scan.views, excluded)
-        self.motion = self.start
+        self.motion = self.origin = self.start
         points = sample_points(self.region.sample)
         self.gauge = Gauge(self.scan.geometry, points, magnification=self.scale)
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
@@ -110,26 +127,49 @@ class CoarseToFine:
         self.several = sum(stage.limit for stage in stages) > 1
         first, done = (0, 0) if saved is None else self._go_on_from(saved)
         try:
+            if saved is None and self.solver.prealign and is_open(self.schedule, self.start):
+                self._prealign(stages[0].level)
             for index, stage in enumerate(stages):
                 begun = done if index == first else 0
                 if index >= first and begun < stage.limit:
                     self.align_level(stage, index, begun)
         except KeyboardInterrupt:
-            if not self.history:
+            if self.registered is None:
                 raise
             raise AlignmentInterrupted(self.result()) from None
         except Cancelled:
-            if not self.history:
+            if self.registered is None:
                 raise
             message = f"the alignment was ended early, after {finished(self.history)}"
             Finding("cancelled", message).warn()
+
+    def _prealign(self, coarsest: int) -> None:
+        """Begin with what sums over the radiographs tell, if it is of use."""
+        started = time.perf_counter()
+        found = prealigned(self.stream, self.scan, coarsest, self.rejections, self.shift_gauge)
+        if found is None:
+            column = axis_column(self.stream, self.scan)
+            self.motion = self.origin = replace(self.start, shift_u=self.start.shift_u + column)
+            return
+        self._begin_with(found)
+        seconds = time.perf_counter() - started
+        self.history.append(found.entry(seconds, **self._errors()))
+        if self.checkpoint is not None:
+            values = {"position": (0, 0), "history": history_values(self.history)}
+            self.checkpoint.save(finished(self.history), values, prealigned_arrays(found))
+
+    def _begin_with(self, found: Prealignment) -> None:
+        """Take shifts from a pre-alignment; magnifications are right on average, not in a view."""
+        self.prealigned, self.rejections.vouched = found, found.vouched
+        self.motion = replace(found.motion, magnification=self.start.magnification)
+        self.origin = self.motion
 
     def align_level(self, stage: Stage, index: int = 0, done: int = 0) -> None:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        level = Level(self.stream, self.scan, self.region, self.solver, stage.level)
-        if not self.history:
+        level = self.make_level(self.stream, self.scan, self.region, self.solver, stage.level)
+        if self.registered is None:
             self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
         # that one, its first steps would go astray.
@@ -141,7 +181,7 @@ class CoarseToFine:
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(level, title=of)
             wrong = self.rejections.of(found.correlation) & ~self.rejected
-            if not self.history and wrong.any():
+            if self.registered is None and wrong.any():
                 # They were in the first volume: again without, or what they did to the others stays
                 # in the modes that data hardly see, a tenth of all that is left of random motion.
                 self.rejected, level.bias = self.rejected | wrong, None
@@ -173,14 +213,14 @@ class CoarseToFine:
                 break
             # A first step finds too little, see `_move`: the second may well find as much.
             previous = None if self.fresh else update_size(update_u, update_v)[0]
-        if len({entry.level for entry in self.history}) == 1:
+        if len({entry.level for entry in self.history} - {PREALIGNED}) == 1:
             note = warned(lost_features=lost_features(self.scan, found.correlation, stage.level))
             notes = filter(None, (self.history[-1].note, note))
             self.history[-1] = replace(self.history[-1], note="\n".join(notes))
 
     def _iterate(self, level: Level, *, title: str) -> Registered:
         """Algorithm 1, steps 2 to 4."""
-        first = not self.history
+        first = self.registered is None
         shifts_only = first and self._shifts_first
         return level.residual_motion(
             self.motion,
@@ -197,16 +237,18 @@ class CoarseToFine:
 
         Returns the plain step as lengths, and what was warned of.
         """
-        self.registered = found
+        first, self.registered = self.registered is None, found
         self.rejected = self.rejections.of(found.correlation)
         there = self._held(self.motion.then(found.motion), found, level)
         self.found = self.rejections.settled(
-            self.motion, there, self.rejected, first=not self.history
+            self.motion, there, self.rejected, first=first
         ).normalised()
-        there = self.shift_gauge.anchored(self.found, self.start) if self.anchor else self.found
+        there = self.shift_gauge.anchored(self.found, self.origin) if self.anchor else self.found
+        if self.prealigned is not None:
+            there = self.prealigned.held(there, ~self.rejected, scale=self.scale)
         step = self.steps.step(self.motion, there)
         update = np.abs(step[:2, ~self.rejected])
-        if self.history:
+        if not first:
             note = warned(false_shifts=false_shifts(*self.last, level, update))
             self.fresh = bool(note)
         else:
@@ -239,37 +281,44 @@ class CoarseToFine:
             last.update_v_median,
             last.correlation,
         )
-        if self.checkpoint is None:
-            return
+        self.position = stage, done
+        if self.checkpoint is not None:
+            self.checkpoint.save(finished(self.history), *self.state())
+
+    def state(self) -> State:
+        """Return the plain values and arrays by which an interrupted alignment goes on."""
         level, update = self.last
         arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
         arrays |= {"rejected": self.rejected, "update": update}
         arrays["accepted"] = self.rejections.accepted
+        arrays |= prealigned_arrays(self.prealigned) | motion_arrays("origin", self.origin)
         values = {
-            "position": (stage, done),
+            "position": self.position,
             "history": history_values(self.history),
             "level": level,
             "fresh": self.fresh,
             "reasons": list(self.rejections.reasons.items()),
         }
-        self.checkpoint.save(
-            finished(self.history), values, arrays | registered_arrays(self.registered)
-        )
+        return values, arrays | registered_arrays(self.registered)
 
     def _go_on_from(self, saved: Saved) -> tuple[int, int]:
         """Take up a kept state; return the stage and how many of its iterations are done."""
         arrays, values, cause = saved.arrays, saved.values, self.start.cause
+        before = prealigned_from(arrays)
+        if before is not None:
+            self._begin_with(before)
+        self.history = history_from(values["history"])
+        stage, done = self.position = tuple(values["position"])
+        self.registered = registered_from(arrays)
+        if self.registered is None:
+            return stage, done
+        self.origin = motion_from(arrays, "origin", cause)
         self.motion = motion_from(arrays, "motion", cause)
         self.found = motion_from(arrays, "found", cause)
         self.rejected, self.fresh = arrays["rejected"], values["fresh"]
         self.rejections.accepted = arrays["accepted"].astype(np.bool_)
         self.rejections.reasons = {int(view): reason for view, reason in values["reasons"]}
         self.last = values["level"], arrays["update"]
-        self.history = history_from(values["history"])
-        registered = registered_from(arrays)
-        assert registered is not None  # by every iteration
-        self.registered = registered
-        stage, done = values["position"]
         return stage, done
 
     @property
@@ -284,7 +333,8 @@ class CoarseToFine:
         return self.gauge.error(self.motion, self.truth).means()
 
     def result(self) -> AlignmentResult:
-        """Return what the iterations so far gave."""
+        """Return what the iterations so far gave, one at least."""
+        assert self.registered is not None
         for finding in self.rejections.findings(self.rejected):
             finding.warn()
         return AlignmentResult.of(

@@ -57,6 +57,11 @@ class Solver:
         takes many iterations to get rid of.
     spread : float
         Expected standard deviation of log(magnification); 0 if nothing is known.
+    prealign : bool
+        Begin schedule "auto" with shifts by sums over the radiographs, where the motion is large or
+        the scan an arc of a parallel beam, whose slow modes they tell better than re-projections,
+        see :func:`clra.methods.alignment.prealignment.prealignment.prealigned`; on other arcs with
+        the column of the axis.
     """
 
     estimator: str = "gauss-newton"
@@ -67,6 +72,7 @@ class Solver:
     unbias: bool = True
     shifts_first: bool = True
     spread: float = SPREAD
+    prealign: bool = True
 
     def __post_init__(self) -> None:
         if self.estimator not in ESTIMATORS:
@@ -84,6 +90,7 @@ class Solver:
             unbias=False,
             shifts_first=False,
             spread=0.0,
+            prealign=False,
         )
 
     def registration(

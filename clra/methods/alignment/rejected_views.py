@@ -53,12 +53,15 @@ class Rejections:
         Why a view's pixels alone reject it.
     accepted : ndarray of bool, (views,)
         Whether a registration of the view was accepted so far.
+    vouched : ndarray of bool, (views,)
+        Views that are known to show the sample: no correlation rejects them.
     """
 
     def __init__(self, views: int, excluded: Iterable[int] = ()) -> None:
         self.excluded = _marked(excluded, views)
         self.reasons: dict[int, str] = {}
         self.accepted = np.zeros(views, np.bool_)
+        self.vouched = np.zeros(views, np.bool_)
 
     def first(self, stream: Stream, radiographs: Radiographs) -> NDArray[np.bool_]:
         """Return the views that are rejected before anything is registered, (views,)."""
@@ -67,7 +70,7 @@ class Rejections:
 
     def of(self, correlation: Floats) -> NDArray[np.bool_]:
         """Return the views that are rejected for their correlations, or excluded."""
-        return self.excluded | outliers(correlation)
+        return self.excluded | (outliers(correlation) & ~self.vouched)
 
     def settled(
         self, before: Motion, after: Motion, rejected: NDArray[np.bool_], *, first: bool

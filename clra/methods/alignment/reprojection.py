@@ -67,6 +67,11 @@ class Registered:
     residual: Floats
     sigma: Floats
 
+    @property
+    def unexplained(self) -> Floats:
+        """Part of each measured radiograph that its simulated counterpart is not, (views,)."""
+        return np.sqrt(1 - np.clip(self.correlation, 0, 1) ** 2)
+
 
 def with_margin(grid: VolumeGrid) -> VolumeGrid:
     """Return a grid with planes added at both ends, for what views at the ends of a scan see."""
@@ -154,6 +159,12 @@ def binned_mask(mask: NDArray[np.bool_], level: int) -> NDArray[np.bool_]:
     rows, columns = (n // level for n in mask.shape)
     blocks = mask[: rows * level, : columns * level].reshape(rows, level, columns, level)
     return np.asarray(blocks.all(axis=(1, 3)))
+
+
+def used_pixels(scan: Scan, level: int) -> NDArray[np.bool_]:
+    """Return the pixels of the binned detector that count in reconstructions."""
+    full = np.ones(scan.geometry.shape, np.bool_) if scan.mask is None else scan.mask
+    return binned_mask(full, level)
 
 
 def reprojected(

@@ -17,6 +17,9 @@ from clra.model.motion import Motion
 
 Floats = NDArray[np.float64]
 
+PREALIGNED = "PA"
+"""Level of a history's entry for what is found before the first reconstruction."""
+
 
 @dataclass(frozen=True)
 class Iteration:
@@ -25,7 +28,8 @@ class Iteration:
     Attributes
     ----------
     level : str
-        "ER", "QR", "HR" or "FR".
+        "SR", "ER", "QR", "HR" or "FR"; "PA" for a pre-alignment, whose correlation and residual
+        are those of the rows' sums.
     iteration : int
         From 1 at each level.
     update_u_median, update_v_median, update_max : float
@@ -97,6 +101,8 @@ class SupportsAsDict(Protocol):
 def finished(history: Sequence[Iteration]) -> str:
     """Say what is finished: "2 iterations, the last at HR"."""
     count = len(history)
+    if history[-1].level == PREALIGNED:
+        return "the pre-alignment"
     return f"{count} iteration{'s' * (count > 1)}, the last at {history[-1].level}"
 
 

@@ -99,7 +99,7 @@ def agreement(
         stage = f"report: volume {name}"
         volume = ramp_fbp(stream, radiographs, geometry, grid, valid_views=chosen, stage=stage)
         found = registered(geometry, volume, name, still=True)
-        unexplained.append(float(np.median(np.sqrt(1 - np.clip(found.correlation, 0, 1) ** 2))))
+        unexplained.append(float(np.median(found.unexplained)))
         gradients.append(_gradient(volume.to_host()))
     halves = []
     for name, first in (("even views", 0), ("views between", 1)):

@@ -6,36 +6,48 @@ not negative and found by iteration: ramp-filtered back-projection is a poor inv
 missing, and its artefacts would hide the difference.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from clra.methods.alignment.reprojection import (
+    Registered,
     band_of,
+    in_full_pixels,
+    register,
     registration_for,
-    reproject_and_register,
+    reprojected,
 )
+from clra.methods.assessment.residual_regions import PARTS, residual_by_part
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
+from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.subsets import ordered_subsets
+from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
 
 # Updates of the volume, all subsets of all passes.
 _UPDATES = 9
-# Parts of the views, each predicted from the others: of few views a half is too few to go by.
-_FEW, _PARTS, _PARTS_OF_FEW = 60, 2, 4
+FEW = 60
+"""Number of views below which a half of them is too few to go by."""
+# Parts of the views, each predicted from the others.
+_PARTS, _PARTS_OF_FEW = 2, 4
 # Photons that weigh the rays against each other: nearly alike.
 _PHOTONS = 1e3
+# Expected spread of log(magnification), so wide that it pulls nothing: alignments of small images
+# are held to what is expected, and what this hides along slow modes has to show here.
+_SPREAD = 0.1
 # Columns and views of what is looked at, at most: a few seconds whatever the size of the scan.
-_COLUMNS, _VIEWS = 80, 720
+_COLUMNS, _VIEWS = 80, 480
 
 
 @dataclass(frozen=True)
@@ -50,15 +62,15 @@ class Predicted:
     shift : ndarray, (views, 3)
         What registration with the prediction finds to be left: shift_u, shift_v [pixel of the
         full-resolution detector] and log(magnification); 0 where it is not registered.
-    slope : ndarray, (views,)
-        Residual that a shift of one pixel of the full-resolution detector would cause.
+    parts : ndarray, (views, 3, 3)
+        Mean squares of the same residual in each third of the rows and of the columns.
     sharpness : float
         Mean squared gradient of the volumes.
     """
 
     residual: Floats
     shift: Floats
-    slope: Floats
+    parts: Floats
     sharpness: float
 
 
@@ -100,13 +112,14 @@ class HeldOut:
     def radiographs(self, valid_views: NDArray[np.bool_]) -> tuple[Radiographs, NDArray[np.intp]]:
         """Read and bin what is needed; the second value are the views that these are."""
         views = self.chosen(valid_views)
-        return Radiographs(self.stream, self.scan.subset(views), self.level), views
+        return Radiographs(self.stream, self.scan.subset(views), self.level, keep=True), views
 
     def predict(
         self,
         radiographs: Radiographs,
         views: NDArray[np.intp],
         motion: Motion,
+        further: Motion | None = None,
         *,
         magnification: bool,
         whole: bool,
@@ -122,6 +135,8 @@ class HeldOut:
             Of the scan that they are.
         motion : Motion
             Of all views of the scan [pixel of the full-resolution detector].
+        further : Motion, optional
+            That is taken to follow it.
         magnification : bool
             Whether to register it.
         whole : bool
@@ -131,16 +146,19 @@ class HeldOut:
         """
         level, scan = self.level, self.scan.subset(views)
         grid = self.grid.binned(level) if level > 1 else self.grid
-        geometry = scan.geometry.with_motion(motion.subset(views)).binned(level)
+        geometry = scan.geometry.with_motion(motion.subset(views))
+        if further is not None:
+            geometry = geometry.with_motion(further.subset(views))
+        geometry = geometry.binned(level)
         binned = Scan(radiographs, geometry)
         index = np.arange(len(views))
-        parts = _PARTS_OF_FEW if len(views) < _FEW else _PARTS
+        times = _PARTS_OF_FEW if len(views) < FEW else _PARTS
         residual = np.full(self.scan.views, np.nan)
         shift = np.full((self.scan.views, 3), np.nan)
-        slope = np.full(self.scan.views, np.nan)
+        parts = np.full((self.scan.views, PARTS, PARTS), np.nan)
         sharpness = []
-        for part in range(parts if whole else 1):
-            held, train = index[part::parts], np.delete(index, np.s_[part::parts])
+        for part in range(times if whole else 1):
+            held, train = index[part::times], np.delete(index, np.s_[part::times])
             seen, around = Radiographs(self.stream, binned.subset(train), 1), geometry.subset(train)
             count = len(ordered_subsets(around, grid))
             options = OrderedSubsets(passes=ceil(_UPDATES / count), i0=_PHOTONS)
@@ -149,44 +167,50 @@ class HeldOut:
             title = f"{stage}: volume {part + 1}"
             osem_tr(self.stream, seen, around, volume, options, used=used, stage=title)
             hidden = Radiographs(self.stream, binned.subset(held), 1)
-            still, moved = (
-                reproject_and_register(
+            registrations = [
+                registration_for(
                     self.stream,
-                    hidden,
-                    volume,
-                    geometry.subset(held),
-                    registration_for(
-                        self.stream,
-                        scan,
-                        radiographs,
-                        first=False,
-                        magnification=magnification,
-                        still=where_it_lies,
-                    ),
-                    magnification=np.ones(len(held)),
-                    detector=geometry.shape,
-                    stage=f"{stage}: comparing",
+                    scan,
+                    radiographs,
+                    first=False,
+                    magnification=magnification,
+                    spread=_SPREAD,
+                    still=where_it_lies,
                 )
                 for where_it_lies in (True, False)
+            ]
+            (still, moved), parts[views[held]] = self._compared(
+                registrations, hidden, volume, geometry.subset(held), f"{stage}: comparing"
             )
-            residual[views[held]] = np.sqrt(1 - np.clip(still.correlation, 0, 1) ** 2)
-            for view, image in zip(views[held], hidden.read(slice(0, len(held))), strict=True):
-                slope[view] = _slope(image) / level
+            residual[views[held]] = still.unexplained
             found = moved.motion
             shift[views[held]] = np.stack(
                 [level * found.shift_u, level * found.shift_v, np.log(found.magnification)], axis=1
             )
             sharpness.append(_gradient(volume.to_host()))
-        return Predicted(residual, shift, slope, float(np.mean(sharpness)))
+        return Predicted(residual, shift, parts, float(np.mean(sharpness)))
 
-
-def _slope(image: NDArray[np.float32]) -> float:
-    """RMS slope of a radiograph along rows and columns, relative to its own, in the band used."""
-    low, high = band_of((image.shape[0], image.shape[1]))
-    band = gaussian_filter(image.astype(np.float64), low) - gaussian_filter(image, high)
-    slopes = np.gradient(band)
-    power = float(np.mean(band**2))
-    return float(np.sqrt(0.5 * np.mean(slopes[0] ** 2 + slopes[1] ** 2) / power)) if power else 0.0
+    def _compared(
+        self,
+        registrations: Sequence[Registration],
+        hidden: Radiographs,
+        volume: Volume,
+        geometry: ConeBeamGeometry,
+        stage: str,
+    ) -> tuple[list[Registered], Floats]:
+        """Register held-out views with one prediction in several ways; what it leaves by part."""
+        tables = np.empty((len(registrations), geometry.views, len(ESTIMATE_FIELDS)))
+        parts = np.empty((geometry.views, PARTS, PARTS))
+        known, band = np.ones(geometry.views), band_of(geometry.shape)
+        for views, measured, simulated in reprojected(self.stream, hidden, volume, geometry, stage):
+            for table, registration in zip(tables, registrations, strict=True):
+                table[views] = register(
+                    self.stream, registration, measured, simulated, known[views]
+                )
+            parts[views] = residual_by_part(
+                hidden.read(views), self.stream.download(simulated), band
+            )
+        return [in_full_pixels(table, 1, geometry.shape) for table in tables], parts
 
 
 def _gradient(volume: NDArray[np.float32]) -> float:

@@ -9,6 +9,7 @@ from scipy.ndimage import uniform_filter
 from clra.errors import InputError
 from clra.findings import Finding
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import axis_ranges
 from clra.model.sampling.angular_coverage import covered, fan_angle
 from clra.model.scan import Scan
 
@@ -30,6 +31,10 @@ _CLIPPED = 0.005
 _SATURATED = 0.05
 # Part of the columns by which the axis may lie aside before half of the sample is out of sight.
 _ASIDE = 0.1
+# Part of the detector's height by which views have to rise for ends along z to be looked at, how
+# many views there are at each, and the part of the largest line integral that may be left in their
+# outermost rows.
+_LIFT, _END_VIEWS, _AT_END = 0.1, 3, 0.1
 # Views below which none can be held out without leaving a gap.
 _FEW = 40
 
@@ -86,7 +91,7 @@ def radiograph_findings(scan: Scan) -> list[Finding]:
     found = [_fading(bright, views), *_clipped(images[:: max(1, len(images) // _CLOSELY)])]
     columns = np.array([_border(image[:, [0, -1]]) for image in images]) - bright[:, None]
     found.append(_truncation(columns, most, scan.geometry))
-    found += [_arc(scan.geometry), _few(scan.geometry)]
+    found += [_axial(scan, most), _arc(scan.geometry), _few(scan.geometry)]
     return [finding for finding in found if finding is not None]
 
 
@@ -195,6 +200,38 @@ def _truncation(columns: Floats, most: float, geometry: ConeBeamGeometry) -> Fin
         "shifts along u are less certain; intensities are too high, most towards the border of "
         "the field of view",
         measured={"border": cut, "largest": most},
+    )
+
+
+def _axial(scan: Scan, most: float) -> Finding | None:
+    """Of the rows that look past the ends of a scan along z."""
+    geometry = scan.geometry
+    low, high = axis_ranges(geometry)
+    if np.ptp(low) < _LIFT * float(np.median(high - low)):
+        return None  # a long sample does no harm where all views see the same part of it
+    ends = {"bottom": (np.argsort(low), -1.0), "top": (np.argsort(-high), 1.0)}
+    seen = {}
+    for name, (order, outwards) in ends.items():
+        rows = []
+        for view in order[:_END_VIEWS]:
+            image = scan.read(int(view), int(view) + 1)[0]
+            smooth = uniform_filter(image, 5)
+            strip = max(2, len(image) // 24)
+            outermost = smooth[-strip:] if geometry.v[view, 2] * outwards > 0 else smooth[:strip]
+            rows.append(float(np.quantile(outermost, 0.99) - np.quantile(smooth, 0.05)))
+        seen[name] = float(np.median(rows))
+    cut = {name: value for name, value in seen.items() if value > _AT_END * most}
+    if not cut:
+        return None
+    return Finding(
+        "axial-truncation",
+        f"the sample reaches beyond the {' and the '.join(cut)} of what the scan covers (line "
+        f"integrals of {max(cut.values()):.3g} in the outermost rows of views there, {most:.3g} "
+        "elsewhere)",
+        "motions of these views and the slices there are less certain: scan beyond the sample's "
+        "ends, or leave these slices out",
+        "info",
+        {**cut, "largest": most},
     )
 
 

@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.methods.alignment.prealignment.prealignment import Prealignment
 from clra.methods.alignment.reprojection import Registered
 from clra.methods.alignment.result import Iteration
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 
 Arrays = Mapping[str, NDArray[Any]]
+State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
+"""Plain values and arrays, as :meth:`clra.methods.execution.checkpoint.Checkpoint.save` keeps."""
 
 
 def motion_arrays(name: str, motion: Motion) -> dict[str, NDArray[Any]]:
@@ -53,3 +56,23 @@ def history_values(history: tuple[Iteration, ...] | list[Iteration]) -> list[dic
 def history_from(values: list[dict[str, Any]]) -> list[Iteration]:
     """Return the iterations that :func:`history_values` packed."""
     return [Iteration(**value) for value in values]
+
+
+def prealigned_arrays(found: Prealignment | None) -> dict[str, NDArray[Any]]:
+    """Return a pre-alignment, if there is one."""
+    if found is None:
+        return {}
+    quality = np.array([found.correlation, found.residual])
+    arrays = {"prealigned_known": found.known, "prealigned_exact": found.exact}
+    arrays |= {"prealigned_quality": quality}
+    return motion_arrays("prealigned", found.motion) | arrays
+
+
+def prealigned_from(arrays: Arrays) -> Prealignment | None:
+    """Return the pre-alignment that :func:`prealigned_arrays` packed."""
+    if "prealigned" not in arrays:
+        return None
+    correlation, residual = arrays["prealigned_quality"].tolist()
+    motion = motion_from(arrays, "prealigned", "detector")
+    known, exact = arrays["prealigned_known"], arrays["prealigned_exact"]
+    return Prealignment(motion, known, exact, correlation, residual)

@@ -1,25 +1,19 @@
-"""One reconstruction on several devices: each takes some planes of the volume at a time."""
+"""Tasks on several devices of this machine: each takes the next one when it has done with one."""
 
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from pathlib import Path
 from queue import Empty, SimpleQueue
+from typing import Any
 
-import numpy as np
 import pyopencl as cl
-from numpy.typing import NDArray
 
+from clra.methods.execution.executor import PARTS, Item, Result, Task
 from clra.ops.streaming.memory import host_memory
-from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import PlaneWriter
+from clra.ops.streaming.stream import Stream, equal_runs
 from clra.progress import Progress, ProgressCallback
 
-Work = Callable[[Stream, slice, PlaneWriter], None]
-
-# Parts a device: with more, a slow device holds the others up less, but radiographs are filtered
-# anew for each part that they see.
-_PARTS = 3
 # Steps of the progress that all devices make together.
 _STEPS = 1000
 
@@ -28,100 +22,118 @@ class _StoppedError(Exception):
     """Another device's work failed."""
 
 
-def on_devices(
-    devices: Sequence[cl.Device],
-    work: Work,
-    planes: int,
-    target: PlaneWriter,
-    *,
-    progress: ProgressCallback | None = None,
-    max_device_memory: int | None = None,
-    max_host_memory: int | None = None,
-) -> None:
-    """Reconstruct a volume on several devices.
+class SeveralDevices:
+    """Tasks in one thread a device; see :class:`clra.methods.execution.executor.Executor`.
 
     Parameters
     ----------
     devices : sequence of cl.Device
         One or more.
-    work : callable
-        Reconstructs some planes of the grid on the device of a stream, into what takes them.
-    planes : int
-        Of the whole volume.
-    target : PlaneWriter
-        Takes the planes of the whole, from one device at a time.
     progress : callable, optional
-        Called with a :class:`clra.progress.Progress` as work goes on, likewise.
+        Called with a :class:`clra.progress.Progress` as work goes on, from one thread at a time.
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used: on each device, and on the host by all.
-
-    Raises
-    ------
-    Exception
-        What the work raised first; the other devices stop.
     """
-    count = min(planes, _PARTS * len(devices))
-    parts: SimpleQueue[slice] = SimpleQueue()
-    for start, stop in pairwise([planes * k // count for k in range(count + 1)]):
-        parts.put(slice(start, stop))
-    share = _Share(target, progress, count)
-    host = (max_host_memory or host_memory() // 2) // len(devices)
-    workers = [_Worker(share, device, max_device_memory, host) for device in devices]
-    with ThreadPoolExecutor(len(workers)) as pool:
-        futures = [pool.submit(worker.run, work, parts) for worker in workers]
-        try:
-            errors = [error for future in futures if (error := future.exception())]
-        except BaseException:  # Ctrl-C
-            share.stopped = True
-            raise
-    for error in errors:
-        if not isinstance(error, _StoppedError):
-            raise error
+
+    folder: Path | None = None
+
+    def __init__(
+        self,
+        devices: Sequence[cl.Device],
+        *,
+        progress: ProgressCallback | None = None,
+        max_device_memory: int | None = None,
+        max_host_memory: int | None = None,
+    ) -> None:
+        self.places = len(devices)
+        self._devices, self._progress = devices, progress
+        self._device_memory = max_device_memory
+        self._host_memory = (max_host_memory or host_memory() // 2) // len(devices)
+
+    def parts(self, shape: tuple[int, int, int]) -> list[slice]:
+        """Cut the planes of a volume (nz, ny, nx) into tasks, some for each device."""
+        return equal_runs(shape[0], min(shape[0], PARTS * self.places))
+
+    def map(
+        self,
+        task: Task[Item, Result],
+        items: Sequence[Item],
+        *,
+        stage: str,
+        done: Callable[[int], None] | None = None,
+    ) -> list[Result]:
+        """Do a task with each of some items; progress has the names of the tasks' own stages.
+
+        Raises
+        ------
+        Exception
+            What a task raised first; the other devices stop.
+        """
+        share = _Share(task, items, self._progress, done)
+        limits = {
+            "max_device_memory": self._device_memory,
+            "max_host_memory": self._host_memory,
+        }
+        workers = [_Worker(share, device, limits) for device in self._devices]
+        with ThreadPoolExecutor(len(workers)) as pool:
+            futures = [pool.submit(worker.run) for worker in workers]
+            try:
+                errors = [error for future in futures if (error := future.exception())]
+            except BaseException:  # Ctrl-C
+                share.stopped = True
+                raise
+        for error in errors:
+            if not isinstance(error, _StoppedError):
+                raise error
+        return [share.results[number] for number in range(len(items))]
 
 
 class _Share:
     """What the devices have in common."""
 
-    def __init__(self, target: PlaneWriter, progress: ProgressCallback | None, parts: int) -> None:
-        self.target, self.progress, self.parts = target, progress, parts
+    def __init__(
+        self,
+        task: Task[Any, Any],
+        items: Sequence[Any],
+        progress: ProgressCallback | None,
+        done: Callable[[int], None] | None,
+    ) -> None:
+        self.task, self.progress, self.told = task, progress, done
+        self.count = len(items)
+        self.items: SimpleQueue[tuple[int, Any]] = SimpleQueue()
+        for number, item in enumerate(items):
+            self.items.put((number, item))
+        self.results: dict[int, Any] = {}
         self.lock = threading.Lock()
         self.stopped = False
-        self.done = 0.0  # parts, and the begun parts of parts
+        self.done = 0.0  # items, and the begun parts of items
 
 
 class _Worker:
-    """A device that takes one part after the other."""
+    """A device that takes one item after the other."""
 
-    def __init__(
-        self, share: _Share, device: cl.Device, device_memory: int | None, host_memory: int
-    ) -> None:
+    def __init__(self, share: _Share, device: cl.Device, limits: dict[str, Any]) -> None:
         self._share = share
-        self._stream = Stream(
-            device,
-            max_device_memory=device_memory,
-            max_host_memory=host_memory,
-            report=self._report,
-        )
-        self._start = 0
+        self._stream = Stream(device, report=self._report, **limits)
         self._done = 0.0
 
-    def run(self, work: Work, parts: SimpleQueue[slice]) -> None:
-        """Work as long as there are parts."""
+    def run(self) -> None:
+        """Work as long as there are items."""
+        share = self._share
         try:
             while True:
-                part = parts.get_nowait()
-                self._start, self._done = part.start, 0.0
-                work(self._stream, part, self)
+                number, item = share.items.get_nowait()
+                self._done = 0.0
+                result = share.task(self._stream, item)
+                with share.lock:
+                    share.results[number] = result
+                    if share.told is not None:
+                        share.told(number)
         except Empty:
             return
         except BaseException:
-            self._share.stopped = True
+            share.stopped = True
             raise
-
-    def write(self, start: int, planes: NDArray[np.float32], /) -> None:
-        """Hand planes of the present part on."""
-        with self._share.lock:
-            self._share.target.write(self._start + start, planes)
 
     def _report(self, progress: Progress) -> None:
         """Hand on how far all devices are; or stop."""
@@ -133,5 +145,5 @@ class _Worker:
             share.done += max(0.0, done - self._done)
             self._done = max(done, self._done)
             if share.progress is not None:
-                steps = round(_STEPS * share.done / share.parts)
+                steps = round(_STEPS * share.done / share.count)
                 share.progress(Progress(progress.stage, steps, _STEPS))

@@ -91,8 +91,8 @@ def ramp_fbp(
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
     onto : Volume, optional
-        On this grid, in the same slabs: changed to ``max(0, onto + what is reconstructed)`` and
-        returned. `positive`, `planes` and `target` do not go with it.
+        On the grid of the planes: changed to ``max(0, onto + what is reconstructed)`` and returned.
+        `positive` and `target` do not go with it.
 
     Returns
     -------

@@ -19,7 +19,7 @@ VOLUMES = 2
 # Of the corrections. Where views are few for the width of the sample, B A is more than 1 for fine
 # detail, and beyond 2 the series diverges: 77 views of 256 pixels at a distance of 2 degrees ended
 # at 0.13 pixel in v with a full ramp, 0.02 with this; the paper's scans at 0.013 instead of 0.008.
-_WINDOW = "hann"
+WINDOW = "hann"
 
 
 def fitted_fbp(
@@ -86,7 +86,7 @@ def fitted_fbp(
             beside=beside,
             extend=reach,
             positive=positive and onto is None,
-            window="ram-lak" if onto is None else _WINDOW,
+            window="ram-lak" if onto is None else WINDOW,
             volumes=volumes,
             onto=onto,
             stage=f"{stage}: {doing}",

@@ -11,24 +11,22 @@ from clra.errors import InputError
 from clra.findings import Finding, collected
 from clra.methods.alignment.align import align as align_scan
 from clra.methods.alignment.result import AlignmentResult
-from clra.methods.correction import corrected
 from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of
-from clra.methods.execution.several_devices import Work, on_devices
+from clra.methods.execution.choice import check_for_cluster, executing
+from clra.methods.execution.executor import reconstruct_planes
 from clra.methods.preparation import prepared, used_views
 from clra.methods.reconstruction import iterative
-from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.imgr_state import ImgrStep
 from clra.methods.reconstruction.iterative import Options
-from clra.methods.reconstruction.katsevich import Exact, exact_helices, katsevich
+from clra.methods.reconstruction.katsevich import Exact, exact_helices
 from clra.methods.reconstruction.missing_views import without_gaps
-from clra.methods.truncation import truncated
+from clra.methods.reconstruction.scan_checks import warn_of_method, warn_of_scan
+from clra.methods.reconstruction.some_planes import SomePlanes
 from clra.model.binning import binned_motion, binned_scan
 from clra.model.corrections.correction_options import CorrectionOptions
-from clra.model.detector_pose import steep_rows
 from clra.model.grid import Region, VolumeGrid, volume_grid
 from clra.model.helix.pi_intervals import heights_between
 from clra.model.motion import Motion
-from clra.model.sampling.angular_coverage import part_of_a_turn
 from clra.model.scan import Scan
 from clra.model.validation import checked_valid_views
 from clra.ops.filtering.ramp import WINDOWS
@@ -62,6 +60,7 @@ def reconstruct(
     roi: Region | None = None,
     voxel_size: float | None = None,
     window: str = "ram-lak",
+    cluster: Any = None,
 ) -> NDArray[np.float32]:
     """Reconstruct a volume.
 
@@ -111,6 +110,9 @@ def reconstruct(
         Of the grid if none is given, as :func:`clra.model.grid.volume_grid` takes them.
     window : {"ram-lak", "shepp-logan", "hann"}
         Of the ramp filter of "fbp": the latter two trade resolution for less noise.
+    cluster : distributed.Client or str, optional
+        Workers to share "fbp" or "katsevich" out to, and an alignment: a client of Dask, or
+        "local:N", "slurm:N", the address of a scheduler or its file. The scan has to be in a file.
 
     Returns
     -------
@@ -147,6 +149,7 @@ def reconstruct(
         corrections=corrections,
         binning=binning,
         window=window,
+        cluster=cluster,
     )
     return planes.volume
 
@@ -192,6 +195,7 @@ def reconstruct_into(
     roi: Region | None = None,
     voxel_size: float | None = None,
     window: str = "ram-lak",
+    cluster: Any = None,
 ) -> Reconstruction:
     """Reconstruct a volume, and hand it on some planes at a time.
 
@@ -201,7 +205,7 @@ def reconstruct_into(
         Takes the planes, each once; `open_volume` gives one that writes a file.
     scan, method, grid, motion, align, device, alignment, valid_views, options, progress, \
     checkpoint, resume, max_device_memory, max_host_memory, corrections, binning, roi, voxel_size, \
-    window
+    window, cluster
         As :func:`reconstruct` takes them.
 
     Returns
@@ -226,6 +230,7 @@ def reconstruct_into(
         valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
         valid_views = checked_valid_views(valid_views, scan.views)
+    check_for_cluster(cluster, scan, method, ("fbp", "katsevich"))
     options = iterative.checked_options(method, options)
     keeping, own = checkpoint_of(checkpoint, resume)
     if keeping is not None and keeping.resume and options is None and not align:
@@ -255,13 +260,20 @@ def reconstruct_into(
                     raise InputError.at(begun.folder, "checkpoint", "none", "one to go on from")
                 keeping.resume = keeping.there if begun.resume else keeping.resume
             alignment = align_scan(
-                scan, device=devices[0], progress=progress, checkpoint=begun, **limits
+                scan,
+                device=devices[0],
+                progress=progress,
+                checkpoint=begun,
+                cluster=cluster,
+                **limits,
             )
             motion, valid_views = alignment.motion, alignment.valid_views
         if motion is not None:
             motion = binned_motion(motion, binning, scan.geometry.shape)
         scan = small
-        _warn_of_scan(stream, scan, method)
+        warn_of_method(stream, scan, method)
+        if alignment is None and not align:
+            warn_of_scan(stream, scan, motion)
         if fitted is not None:
             there = scan.views if valid_views is None else int(valid_views.sum())
             _warn_of_gaps(fitted, grid, there)
@@ -271,61 +283,12 @@ def reconstruct_into(
             steps, found = iterative.iterate(stream, target, request, keeping)
             alignment = found or alignment
         else:
-            work = _work(scan, grid, motion, valid_views, fitted, window)
-            if len(devices) == 1:
-                work(stream, slice(0, grid.shape[0]), target)
-            else:
-                on_devices(devices, work, grid.shape[0], target, progress=progress, **limits)
+            work = SomePlanes(scan, grid, motion, valid_views, fitted, window)
+            with executing(stream, devices, cluster, scan, keeping, progress, limits) as executor:
+                reconstruct_planes(executor, work, grid.shape, target, stage="back-projecting")
     if own and keeping is not None and not cancelled(findings):
         keeping.clear()
     return Reconstruction(tuple(findings), steps, alignment)
-
-
-def _work(
-    scan: Scan,
-    grid: VolumeGrid,
-    motion: Motion | None,
-    valid_views: NDArray[np.bool_] | None,
-    fitted: Exact | None,
-    window: str,
-) -> Work:
-    """Return what reconstructs some planes: by Katsevich's method if helices are given."""
-
-    def work(stream: Stream, planes: slice, target: PlaneWriter) -> None:
-        if fitted is not None:
-            ideal = scan if motion is None else corrected(stream, scan, motion)
-            whole = without_gaps(ideal, valid_views)
-            radiographs = Radiographs(stream, whole, 1)
-            part = grid.slab(planes.start, planes.stop)
-            katsevich(stream, radiographs, whole.geometry, part, fitted=fitted, target=target)
-        else:
-            geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
-            radiographs = Radiographs(stream, scan, 1)
-            ramp_fbp(
-                stream,
-                radiographs,
-                geometry,
-                grid,
-                valid_views=valid_views,
-                window=window,
-                planes=planes,
-                target=target,
-            )
-
-    return work
-
-
-def _warn_of_scan(stream: Stream, scan: Scan, method: str) -> None:
-    """Warn of what a method makes less of than a scan's users may think."""
-    notes = {}
-    if method == "fbp":
-        notes["short-scan"] = part_of_a_turn(scan.geometry)
-        notes["cone-angle"] = steep_rows(scan.geometry)
-    if method != "katsevich":  # that refuses such samples
-        notes["truncation"] = truncated(Radiographs(stream, scan, 1), scan.geometry)
-    for code, note in notes.items():
-        if note:
-            Finding(code, note).warn()
 
 
 def _warn_of_gaps(fitted: Exact, grid: VolumeGrid, there: int) -> None:

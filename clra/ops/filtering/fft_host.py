@@ -1,7 +1,6 @@
 """Real Fourier transforms on the host, for CPU devices: see :mod:`clra.ops.filtering.fft`."""
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -19,14 +18,15 @@ _READ = cl.map_flags.READ
 
 
 class HostFFT:
-    """pocketfft on mapped buffers, in blocks, on as many threads as there are cores."""
+    """pocketfft on mapped buffers, in blocks, on as many threads as the device has."""
 
     def __init__(
         self, context: cl.Context, shape: tuple[int, int, int], axes: tuple[int, ...]
     ) -> None:
         self._axes = axes
         self._lengths = shape[axes[0] :]
-        self._cores = os.cpu_count() or 1
+        # Fewer than the machine has where several processes share it.
+        self._cores = max(1, context.devices[0].max_compute_units)
         self._pool = ThreadPoolExecutor(self._cores)
 
     def forward(

@@ -144,10 +144,10 @@ class Layout:
         return max(1, images // self._images)
 
     def batches(self, count: int) -> Iterator[tuple[int, int]]:
-        """Cut `count` views into runs that fit the scratch."""
+        """Cut `count` views into runs that fit the scratch, the longest first: it allocates it."""
         runs = -(-count // self._most)
         for run in range(runs):
-            yield count * run // runs, count * (run + 1) // runs
+            yield -(-count * run // runs), -(-count * (run + 1) // runs)
 
     def gather_projections(
         self, queue: cl.CommandQueue, projections: Array, wait_for: Sequence[cl.Event]

@@ -1,5 +1,7 @@
 """Radiographs of one resolution, read in chunks."""
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 from pyopencl.array import Array
@@ -11,6 +13,19 @@ from clra.ops.streaming.memory import Store, keeps
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float32]
+
+
+class KeptRadiographs(Protocol):
+    """Where radiographs are kept, such as `Store`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Views, rows, columns."""
+        ...
+
+    def read(self, start: int, stop: int) -> Floats:
+        """Return the views `start` to `stop - 1`."""
+        ...
 
 
 class Radiographs:
@@ -27,7 +42,9 @@ class Radiographs:
     scan : Scan
         At full resolution.
     level : int
-        Binning factor: 1, 2, 4 or 8.
+        Binning factor: 1, 2, 4, 8 or 16.
+    keep : bool
+        Whether they are read once even if they are not binned: for few that are used often.
 
     Attributes
     ----------
@@ -38,16 +55,16 @@ class Radiographs:
 
     extension: float | None = None
 
-    def __init__(self, stream: Stream, scan: Scan, level: int) -> None:
+    def __init__(self, stream: Stream, scan: Scan, level: int, *, keep: bool = False) -> None:
         self.shape = (scan.views, *scan.geometry.binned(level).shape)
         self.level = level
         self._stream, self._scan = stream, scan
         self._resident: Array | None = None
         self._uploaded: NDArray[np.bool_] | None = np.zeros(scan.views, np.bool_)
-        self._kept: Store | None = None if level == 1 else self._read_all()
+        self._kept: KeptRadiographs | None = self._read_all() if level > 1 or keep else None
 
     @classmethod
-    def of(cls, kept: Store, level: int) -> "Radiographs":
+    def of(cls, kept: KeptRadiographs, level: int) -> "Radiographs":
         """Radiographs (views, rows, columns) of a level that are known already."""
         known = cls.__new__(cls)
         views, rows, columns = kept.shape
@@ -89,10 +106,14 @@ class Radiographs:
         kept = Store(self.shape, stream.room)
         restrict = Restrict2D(stream.context)
         chunks = stream.chunks(self.shape[0], 4 * self._scan.shape[1] * self._scan.shape[2])
-        name = f"reading radiographs, binned {self.level} x {self.level}"
+        binned = f", binned {self.level} x {self.level}" if self.level > 1 else ""
+        name = f"reading radiographs{binned}"
         for views in chunks:
             stream.report(name, views.start, self.shape[0])
             measured = self._scan.read(views.start, views.stop)
+            if self.level == 1:
+                kept.write(views.start, measured)
+                continue
             images = stream.upload(measured)
             for _ in range(self.level.bit_length() - 1):
                 n, rows, columns = images.shape

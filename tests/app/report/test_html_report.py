@@ -13,9 +13,12 @@ from clra.app.report.summary import Errors, Findings, summary_of
 from clra.app.scan_description import Facts
 from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.alignment.rigid.rigid_parts import rigid_parts
 from clra.methods.assessment.agreement import Agreement
 from clra.methods.assessment.quality import Quality
 from clra.model.motion import Motion
+from clra.model.rigid.rigid_motion import RigidMotion
+from clra.model.trajectory import circular
 
 
 class Checker(HTMLParser):
@@ -156,3 +159,26 @@ def test_errors_are_those_of_the_estimate(record, scan):
     assert 0 < means["gauge_free_mae_u"] < 1.2 * expected
     _, text = summary_of(record, errors)
     assert "1QR-1HR" in text and f"{expected:.3f}" in text
+
+
+def test_a_rigid_motion_has_its_six_curves_and_numbers():
+    geometry = circular(
+        8, source_to_axis=40.0, source_to_detector=100.0, pixel_size=0.2, shape=(31, 45)
+    )
+    table = np.zeros((8, 6))
+    table[:, 0], table[:, 4] = 0.3, np.radians(0.5)
+    motion = RigidMotion.of(geometry, table)
+    sigma = np.tile([0.1, 0.1, 1e-3, *np.radians([0.2] * 3)], (8, 1))
+    result = replace(AlignmentResult.from_motion(motion), sigma=sigma)
+    parts = rigid_parts(result)
+    # 0.3 mm at 40 of 100 mm are 0.75 mm, 3.75 pixels; 0.1 pixel is 8 um there.
+    assert parts["along u [\u00b5m]"] == pytest.approx((300, 300, 8))
+    assert parts["along u [pixel]"] == pytest.approx((3.75, 3.75, 0.1))
+    assert parts["along the beam [\u00b5m]"] == pytest.approx((0, 0, 40))
+    assert parts["about v [degree]"] == pytest.approx((0.5, 0.5, 0.2))
+    page = render(Findings(result))
+    assert "Motion of the sample" in page and "about v [degree]" in page
+    assert "80 \u00b5m of the sample" in page
+    values, text = summary_of(result, None)
+    assert values["rigid"]["about v [degree]"]["rms"] == pytest.approx(0.5)
+    assert "0.000, 0.500, 0.000 degrees rms" in text

@@ -15,6 +15,7 @@ from clra.errors import InputError
 from clra.io.scan_files import import_scanner, read_scan
 from clra.io.scanners.recognise import FORMATS, read_scanner, recognise
 from clra.io.scanners.scanner_options import ScannerOptions
+from clra.methods.execution.travelling import read_task, write_task
 from clra.model.geometry import ConeBeamGeometry
 
 
@@ -129,6 +130,18 @@ def test_radiographs_come_top_up_and_from_behind(layout: Layout, tmp_path: Path)
     np.testing.assert_allclose(scan.read(0, VIEWS), -np.log(truth), atol=6 * layout.atol)
     by_folder = read_scan(folder, options=ScannerOptions(**layout.options))
     np.testing.assert_array_equal(by_folder.read(5, 6), scan.read(5, 6))
+
+
+def test_a_scan_is_opened_by_another_process(layout: Layout, tmp_path: Path) -> None:
+    pytest.importorskip("cloudpickle")
+    options = ScannerOptions(**layout.options)
+    geometry = read_scanner(layout.write(tmp_path, None), options).geometry
+    folder = tmp_path / "with"
+    folder.mkdir()
+    scan = read_scan(layout.write(folder, transmission(geometry)), options=options)
+    expected = scan.read(1, 5)  # files are open by now
+    write_task(tmp_path / "task", scan)
+    np.testing.assert_array_equal(read_task(tmp_path / "task").read(1, 5), expected)
 
 
 def test_import_writes_the_same_scan(layout: Layout, tmp_path: Path) -> None:

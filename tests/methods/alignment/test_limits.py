@@ -106,7 +106,7 @@ def _moved(spacing, shift):
 def test_grains_that_a_quarter_loses_are_said_and_half_finds_them():
     scan = _moved(4.0, (-6.25, 5.0))
     with pytest.warns(UserWarning, match=r"^HR moved \d+ of 60 views by 1 pixel or more, .* at QR"):
-        result = clra.align(scan, schedule="5QR-3HR", estimate="shift")
+        result = clra.align(scan, schedule="5QR-3HR", estimate="shift", quality=False)
     at_quarter = [step.mae_v for step in result.history if step.level == "QR"]
     assert min(at_quarter) > 0.5  # of 2.8 pixels on average, with a correlation of 0.98
     assert np.abs(result.motion.shift_v - scan.truth.shift_v).mean() < 0.3

@@ -9,7 +9,8 @@ import pytest
 import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
 from clra.methods.alignment.result import AlignmentResult
-from clra.methods.assessment.quality import Quality, assess, judged
+from clra.methods.assessment.assess import assess
+from clra.methods.assessment.quality import Quality, judged
 from clra.ops.streaming.stream import Stream
 
 VIEWS, SHAPE = 72, (48, 64)
@@ -82,11 +83,20 @@ def test_verdicts(error, residual, views, verdict):
     assert bool(found.reasons) == (verdict != "good")
 
 
+def test_a_slow_error_of_the_magnification_is_doubtful():
+    found = judged(Quality("good", slow_magnification=0.02), 100)
+    assert found.verdict == "doubtful" and found.reasons[0].code == "magnification"
+    assert judged(Quality("good", slow_magnification=0.005), 100).verdict == "good"
+
+
 def test_plain_values_and_back(scan, truth):
     quality = judged(
         Quality("good", residual_after=0.4, error=0.5, residual=(0.25, float("nan"))), 100
     )
     plain = json.loads(json.dumps(quality.as_dict(), allow_nan=False))
+    quality = replace(quality, regions=(((0.1, 0.2), (0.3, 0.4)),))
+    plain = json.loads(json.dumps(quality.as_dict(), allow_nan=False))
+    assert Quality.from_dict(plain).regions == quality.regions
     again = Quality.from_dict({**plain, "of a later version": 1})
     assert again.reasons == quality.reasons and again.shift_after == quality.shift_after
     np.testing.assert_array_equal(again.residual, quality.residual)

@@ -75,3 +75,26 @@ def test_counts_are_no_transmission(integrals):
         refuse_counts(clra.Scan(5000 * transmission, circle(), "transmission"))
     with pytest.raises(InputError, match="expected I / I0"):
         clra.align(clra.Scan(5000 * transmission, circle(), "transmission"))
+
+
+@pytest.mark.parametrize(
+    ("half_height", "told"),
+    [(0.5, []), (1.4, ["axial-truncation"])],  # the scan covers 0.72 to each side of the middle
+)
+def test_a_sample_longer_than_a_helix_is_told(half_height, told):
+    geometry = clra.helix(
+        VIEWS,
+        angle_step=6 * np.pi / VIEWS,
+        z_step=0.96 / VIEWS,
+        source_to_axis=4.0,
+        source_to_detector=20.0,
+        pixel_size=0.1,
+        shape=SHAPE,
+    )
+    rod = Ellipsoids([[0.1, 0, 0]], [[0.3, 0.3, half_height]], [1.0])
+    assert codes(rod.line_integrals(geometry), geometry) == told
+
+
+def test_a_sample_longer_than_a_circle_sees_does_no_harm():
+    rod = Ellipsoids([[0.1, 0, 0]], [[0.3, 0.3, 1.4]], [1.0])
+    assert codes(rod.line_integrals(circle())) == []

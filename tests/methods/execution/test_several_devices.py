@@ -9,7 +9,8 @@ import pytest
 
 import clra
 from clra.errors import DeviceError
-from clra.methods.execution.several_devices import on_devices
+from clra.methods.execution.executor import reconstruct_planes
+from clra.methods.execution.several_devices import SeveralDevices
 from clra.ops.runtime.devices import choose_device
 
 TWICE = """
@@ -68,7 +69,7 @@ def test_the_first_failure_is_told():
 
     device = choose_device()
     with pytest.raises(ValueError, match="plane"):
-        on_devices([device, device], work, 7, None)
+        reconstruct_planes(SeveralDevices([device, device]), work, (7, 1, 1), None, stage="s")
 
 
 def test_every_plane_is_taken_once():
@@ -83,7 +84,8 @@ def test_every_plane_is_taken_once():
             target.write(plane, [None])
 
     device = choose_device()
-    on_devices([device, device, device], work, 23, Target())
+    executor = SeveralDevices([device, device, device])
+    reconstruct_planes(executor, work, (23, 1, 1), Target(), stage="s")
     assert sorted(taken) == [(plane, 1) for plane in range(23)]
 
 

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import outliers
-from clra.methods.alignment.result import AlignmentResult, Iteration
+from clra.methods.alignment.result import AlignmentResult, Iteration, finished
+from clra.methods.alignment.rigid.observability import held
 from clra.methods.alignment.rigid.rigid_level import RigidLevel
-from clra.methods.alignment.rigid.rigid_solution import RigidStep
+from clra.methods.alignment.rigid.rigid_state import RigidState
+from clra.methods.execution.checkpoint import Checkpoint, Saved
+from clra.methods.execution.packing import State
 from clra.model.gauge.gauge import sample_points
 from clra.model.rigid.rigid_gauge import without_rigid_gauge
 from clra.model.rigid.rigid_motion import RigidMotion
@@ -70,6 +73,10 @@ class RigidAlignment:
         Of the shifts alone.
     anchor : bool
         Whether to take the movement of the sample as a whole out of the motion.
+    checkpoint : Checkpoint, optional
+        Keeps each finished iteration.
+    shifts : (dict, dict), optional
+        By which the alignment of the shifts goes on, kept beside it.
     """
 
     stream: Stream
@@ -79,89 +86,121 @@ class RigidAlignment:
     estimate: str
     start: AlignmentResult
     anchor: bool
-    motion: RigidMotion = field(init=False)
-    history: list[Iteration] = field(init=False)
-    rejected: NDArray[np.bool_] = field(init=False)
-    last: RigidStep = field(init=False)
+    checkpoint: Checkpoint | None = None
+    shifts: State = field(default_factory=lambda: ({}, {}))
+    done: RigidState = field(init=False)
 
     def __post_init__(self) -> None:
-        self.motion = RigidMotion.from_shifts(self.start.motion, self.scan.geometry)
-        self.history = list(self.start.history)
-        self.rejected = ~self.start.valid_views
+        motion = RigidMotion.from_shifts(self.start.motion, self.scan.geometry)
+        self.done = RigidState(motion, ~self.start.valid_views, list(self.start.history))
         self.points = sample_points(self.region.sample, count=200)
 
-    def align(self, stages: Sequence[tuple[int, int]] | None = None) -> AlignmentResult:
-        """Go through the resolutions; a stage is a binning and a number of iterations."""
-        for factor, iterations in stages or rigid_stages(self.scan.geometry.shape):
-            self._align_level(factor, iterations)
+    def align(
+        self, saved: Saved | None = None, stages: Sequence[tuple[int, int]] | None = None
+    ) -> AlignmentResult:
+        """Go through the resolutions, or what is left of them.
+
+        Parameters
+        ----------
+        saved : Saved, optional
+            What a checkpoint holds, of this alignment or of the shifts alone.
+        stages : sequence of (int, int), optional
+            Binnings and numbers of iterations; those of `rigid_stages` by default.
+        """
+        self.done = (saved and RigidState.kept(saved)) or self.done
+        first, begun = self.done.position
+        stages = stages or rigid_stages(self.scan.geometry.shape)
+        for index, (factor, iterations) in enumerate(stages):
+            if index > first:
+                self.done = replace(self.done, bias=None, slow=type(self.done.slow)())
+            if index >= first and (index > first or begun < iterations):
+                self._align_level(factor, iterations, index, begun if index == first else 0)
+        table = self.done.motion.table + self._clipped(self.done.slow.left(), 1)
+        self.done.motion = self._anchored(self.done.motion.with_table(table))
+        assert self.done.last is not None
+        alone = self._of_slow_modes_too(self.done.last.alone)
+        free = FREE[self.estimate]
+        self.done.motion = held(self.done.motion, alone, ~self.done.rejected, free)
         return self.result()
 
-    def _align_level(self, factor: int, iterations: int) -> None:
+    def _align_level(self, factor: int, iterations: int, index: int, begun: int) -> None:
         voxel = self.region.grid.voxel_size
         prior = np.array([0, 0, _BEAM * voxel, _TURN, _TURN, _TURN])
         free = FREE[self.estimate]
         # What lies beside the circle that all views see is projected as well, if there is anything.
         solver = replace(self.solver, circle=self.solver.circle and not self.region.truncated)
         level = RigidLevel(self.stream, self.scan, self.region.grid, solver, factor, free, prior)
-        longest = factor * np.array([_LONGEST * voxel] * 3 + [_STEEPEST] * 3)
-        for iteration in range(1, iterations + 1):
-            started = time.perf_counter()
-            name = level_name(factor)
+        level.bias = self.done.bias
+        for iteration in range(begun + 1, iterations + 1):
+            started, before = time.perf_counter(), self.done
+            name, unbiased = level_name(factor), level.bias is None
             step = level.step(
-                self.motion,
-                valid_views=~self.rejected,
+                before.motion,
+                valid_views=~before.rejected,
                 measure=iteration >= min(_BIAS_AFTER, iterations),
                 title=f"{name}, {self.estimate} {iteration}/{iterations}",
             )
-            table = np.clip(step.table, -longest, longest)
-            self.rejected |= outliers(step.correlation)
-            table = self._interpolated(table)
-            before = self.motion
-            self.motion = self.motion.then(self.motion.with_table(table))
-            if self.anchor:
-                self.motion = without_rigid_gauge(self.motion, self.scan.geometry, self.points)
-            self.last = step
-            moved = np.stack(
-                [self.motion.shift_u - before.shift_u, self.motion.shift_v - before.shift_v]
+            rejected = before.rejected | outliers(step.correlation)
+            table = self._interpolated(self._clipped(step.table, factor), rejected)
+            motion = self._anchored(before.motion.then(before.motion.with_table(table)))
+            if not unbiased or not self.solver.unbias:
+                before.slow.add(motion.table - before.motion.table, ~rejected)
+            moved = [getattr(motion, n) - getattr(before.motion, n) for n in ("shift_u", "shift_v")]
+            entry = Iteration.of(
+                name,
+                iteration,
+                np.stack(moved),
+                step.correlation,
+                step.residual,
+                time.perf_counter() - started,
             )
-            self.history.append(
-                Iteration.of(
-                    name,
-                    iteration,
-                    moved,
-                    step.correlation,
-                    step.residual,
-                    time.perf_counter() - started,
-                )
+            history = [*before.history, entry]
+            self.done = RigidState(
+                motion, rejected, history, (index, iteration), step, level.bias, before.slow
             )
+            if self.checkpoint is not None:
+                self.checkpoint.save(finished(history), *self.done.packed(self.shifts))
 
-    def _interpolated(self, table: Floats) -> Floats:
+    def _anchored(self, motion: RigidMotion) -> RigidMotion:
+        if not self.anchor:
+            return motion
+        return without_rigid_gauge(motion, self.scan.geometry, self.points)
+
+    def _clipped(self, table: Floats, factor: int) -> Floats:
+        """Shorten what is beyond the reach of a level."""
+        longest = np.array([_LONGEST * self.region.grid.voxel_size] * 3 + [_STEEPEST] * 3)
+        return np.asarray(np.clip(table, -factor * longest, factor * longest))
+
+    @staticmethod
+    def _interpolated(table: Floats, rejected: NDArray[np.bool_]) -> Floats:
         """Give rejected views the step between their neighbours'."""
-        if not self.rejected.any() or self.rejected.all():
+        if not rejected.any() or rejected.all():
             return table
         views = np.arange(len(table))
-        valid = views[~self.rejected]
-        columns = [np.interp(views, valid, column[valid]) for column in table.T]
+        columns = [np.interp(views, views[~rejected], column[~rejected]) for column in table.T]
         return np.stack(columns, axis=1)
 
     def result(self) -> AlignmentResult:
-        """Return what the iterations so far gave."""
-        valid = ~self.rejected
+        """Return what the iterations so far gave; the shifts alone before the first."""
+        done = self.done
+        if done.last is None:
+            return self.start
+        valid = ~done.rejected
+        near, per_u, per_v = done.motion.optics[:, :3].T
+        sigma = self._of_slow_modes_too(done.last.sigma)
+        for column, factor in enumerate((per_u / near, per_v / near, 1 / near)):
+            sigma[:, column] *= factor
         return AlignmentResult(
-            motion=self.motion,
+            motion=done.motion,
             valid_views=valid,
-            confidence=np.clip(np.where(valid, self.last.correlation, 0.0), 0.0, 1.0),
-            sigma=self._sigma(),
-            history=tuple(self.history),
+            confidence=np.clip(np.where(valid, done.last.correlation, 0.0), 0.0, 1.0),
+            sigma=sigma,
+            history=tuple(done.history),
             gauge=self.start.gauge,
             schedule=self.start.schedule,
             device=self.start.device,
         )
 
-    def _sigma(self) -> Floats:
-        """Return standard errors of shifts [pixel], magnification and rotations [rad]."""
-        near, per_u, per_v = self.motion.optics[:, :3].T
-        sigma = self.last.sigma.copy()
-        for column, factor in enumerate((per_u / near, per_v / near, 1 / near)):
-            sigma[:, column] *= factor
-        return sigma
+    def _of_slow_modes_too(self, sigma: Floats) -> Floats:
+        """Return standard errors that count what adds up in slow modes."""
+        return np.asarray(sigma * self.done.slow.growth(self.scan.views))

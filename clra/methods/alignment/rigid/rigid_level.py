@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
-from clra.methods.alignment.reprojection import binned_mask
+from clra.methods.alignment.reprojection import binned_mask, used_pixels
 from clra.methods.alignment.rigid.rigid_solution import RigidStep, solve
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.geometry import ConeBeamGeometry
@@ -85,25 +85,24 @@ class RigidLevel:
             What progress reports begin with.
         """
         geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
-        volume = self._volume(self.radiographs, geometry, valid_views, title)
-        found = self._registered(self.radiographs, volume, geometry, title)
+        volume = self.reconstructed(self.radiographs, geometry, valid_views, title)
+        found = self.registered(self.radiographs, volume, geometry, title)
         if measure and self.bias is None and self.solver.unbias:
             doing = f"{title}, of what is simulated"
             still = reprojections(self.stream, volume, geometry, self.factor, doing)
             del volume
-            again = self._volume(still, geometry, valid_views, doing)
-            self.bias = self._registered(still, again, geometry, doing).table
+            again = self.reconstructed(still, geometry, valid_views, doing)
+            self.bias = self.registered(still, again, geometry, doing).table
         return found if self.bias is None else found.less(self.bias)
 
-    def _volume(
+    def reconstructed(
         self,
         radiographs: Radiographs,
         geometry: ConeBeamGeometry,
         valid_views: NDArray[np.bool_],
         title: str,
     ) -> Volume:
-        mask = self.scan.mask
-        full = np.ones(self.scan.geometry.shape, np.bool_) if mask is None else mask
+        """Return a volume of radiographs whose geometry has absorbed the motion."""
         return fitted_fbp(
             self.stream,
             radiographs,
@@ -113,14 +112,14 @@ class RigidLevel:
             terms=self.solver.terms,
             valid_views=valid_views,
             circle=self.solver.circle,
-            used=binned_mask(full, self.factor),
+            used=used_pixels(self.scan, self.factor),
             stage=f"{title}: reconstructing",
         )
 
-    def _registered(
+    def registered(
         self, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, title: str
     ) -> RigidStep:
-        """Sum up the normal equations of each view, and solve them."""
+        """Return what displaces radiographs against re-projections of a volume, view by view."""
         stream, mask = self.stream, self.scan.registration_mask
         views, rows, columns = radiographs.shape
         # The registration keeps eight images of a view twice.
@@ -136,18 +135,17 @@ class RigidLevel:
         )
         project = SlabMoments(stream, volume, geometry)
         table = rigid_table(geometry)
-        totals = np.empty((views, PRODUCTS))
+        totals = np.empty((views, register.blocks, PRODUCTS))
         for chunk in chunks:
             stream.report(f"{title}: registering", chunk.start, views)
             count = chunk.stop - chunk.start
             measured = stream.upload(radiographs.read(chunk))
             simulated, over_depth = (stream.empty((count, rows, columns)) for _ in range(2))
             project.moments(simulated, over_depth, chunk)
-            out = stream.empty((count, PRODUCTS))
+            out = stream.empty((count, register.blocks, PRODUCTS))
             numbers = stream.upload(table[chunk])
             register(stream.queue, out, measured, simulated, over_depth, numbers)
             totals[chunk] = stream.download(out)
             del measured, simulated, over_depth, numbers, out
         stream.report(f"{title}: registering", views, views)
-        correlated = 4 * np.pi * register.low_pass**2  # pixels that count as one sample
-        return solve(totals, self.free, self.prior, register.total_weight, max(1.0, correlated))
+        return solve(totals, self.free, self.prior, register.total_weight, register.low_pass)

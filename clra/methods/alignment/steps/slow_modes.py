@@ -12,7 +12,12 @@ _HALF_WAVES, _VIEWS = 16, 6
 _SLOWEST = 0.9
 
 
-def slow_part(values: Floats, weight: Floats) -> Floats:
+def half_waves(views: int) -> int:
+    """Return how many cosines count as slow among so many views."""
+    return max(1, min(_HALF_WAVES, views // _VIEWS))
+
+
+def slow_part(values: Floats, weight: Floats, damping: float = 0.0) -> Floats:
     """Fit cosines of few half waves over the scan.
 
     Parameters
@@ -21,6 +26,9 @@ def slow_part(values: Floats, weight: Floats) -> Floats:
         Of views in order.
     weight : ndarray, (views,)
         Of the squares that the fit minimises; not all zero.
+    damping : float
+        Part of its square by which a mode that all views tell is damped; others more, the fewer of
+        the views tell them.
 
     Returns
     -------
@@ -28,11 +36,14 @@ def slow_part(values: Floats, weight: Floats) -> Floats:
         The fit, at all views.
     """
     views = len(values)
-    count = max(1, min(_HALF_WAVES, views // _VIEWS))
     angle = np.pi * (np.arange(views) + 0.5) / views
+    count = half_waves(views)
     basis = np.cos(np.multiply.outer(angle, np.arange(count)))
+    basis[:, 1:] *= np.sqrt(2)  # each mode's mean square is 1
     root = np.sqrt(weight)
-    found, *_ = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)
+    design = np.concatenate([basis * root[:, None], np.sqrt(damping * views) * np.eye(count)])
+    target = np.concatenate([values * root, np.zeros(count)])
+    found, *_ = np.linalg.lstsq(design, target, rcond=None)
     return np.asarray(basis @ found)
 
 

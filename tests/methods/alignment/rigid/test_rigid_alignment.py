@@ -4,40 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigid_samples import VIEWS, balls, moved_scan
 
 import clra
 from clra.errors import Cancelled, InputError
+from clra.methods.alignment.options import Solver
 from clra.methods.alignment.result import AlignmentInterrupted
+from clra.methods.alignment.rigid.rigid_level import RigidLevel
 from clra.methods.alignment.rigid.rigid_solution import solve
+from clra.methods.execution.checkpoint import Checkpoint
 from clra.model.grid import default_grid
-from clra.model.phantoms.ellipsoids import Ellipsoids
 from clra.model.rigid.rigid_gauge import between, without_rigid_gauge
-from clra.model.rigid.rigid_motion import RigidMotion
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
 
-VIEWS, SIZE = 60, 48
 # Shifts alone leave 0.05 and 0.04 pixel.
-SHIFT, ANGLE = 0.012, 0.16
-
-
-def balls() -> Ellipsoids:
-    random = np.random.default_rng(3)
-    centres = random.uniform(-0.25, 0.25, (30, 3)) * SIZE
-    return Ellipsoids(centres, random.uniform(1.5, 4, 30), random.uniform(0.02, 0.06, 30))
+SHIFT, ANGLE, ROLL = 0.012, 0.16, 0.1
 
 
 @pytest.fixture(scope="module")
 def scan():
-    ideal = clra.circular(
-        VIEWS,
-        source_to_axis=2.5 * SIZE,
-        source_to_detector=3.75 * SIZE,
-        pixel_size=1.5,
-        shape=(64, 64),
-    )
-    size = [1.5, 1.5, 0.5, *np.radians([0.4, 0.4, 0.4])]
-    table = size * np.random.default_rng(4).uniform(-1, 1, (VIEWS, 6))
-    true = ideal.with_motion(RigidMotion.of(ideal, table))
-    return clra.Scan(balls().line_integrals(true, oversample=2), ideal), true
+    return moved_scan([1.5, 1.5, 0.5, *np.radians([0.4, 0.4, 0.4])])
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +94,92 @@ def test_normal_equations_are_solved_view_by_view():
     true = random.normal(size=(3, 7))
     images[:, 7] = np.einsum("nk,nkp->np", true, images[:, :7]) + 0.01 * images[:, 7]
     gram = np.einsum("nip,njp->nij", images, images)
-    totals = np.stack([one[np.triu_indices(8)] for one in gram])
-    found = solve(totals, (0, 1, 2, 3, 4, 5), np.zeros(6), 400.0, 1.0)
+    totals = np.stack([one[np.triu_indices(8)] for one in gram])[:, None]
+    found = solve(totals, (0, 1, 2, 3, 4, 5), np.zeros(6), 400.0, 0.0)
     assert np.abs(found.table - true[:, :6]).max() < 0.004
     assert np.allclose(found.sigma, 0.01 / 20, rtol=0.3)
-    held = solve(totals, (0, 1, 5), np.array([0, 0, 0, 0, 0, 1e-9]), 400.0, 1.0)
+    held = solve(totals, (0, 1, 5), np.array([0, 0, 0, 0, 0, 1e-9]), 400.0, 0.0)
     assert np.abs(held.table[:, 5]).max() < 1e-6 and np.isnan(held.sigma[:, 2:5]).all()
+
+
+@pytest.mark.parametrize(
+    ("estimate", "free"), [("shift+roll", (0, 1, 5)), ("shift+scale+roll", (0, 1, 2, 5))]
+)
+def test_fewer_parameters_are_found_by_themselves(estimate, free):
+    size = [1.5, 1.5, 0, 0, 0, np.radians(0.6)]
+    size[2] = 1.0 if 2 in free else 0.0
+    moved, true = moved_scan(size)
+    aligned = clra.align(moved, estimate=estimate, quality=False)
+    truth = between(moved.geometry, true)
+    points = balls().centres
+    motion = without_rigid_gauge(aligned.motion, moved.geometry, points, reference=truth)
+    wrong = between(true, moved.geometry.with_motion(motion))
+    left, whole = (np.degrees(m.rotation[:, 2].std()) for m in (wrong, truth))
+    assert left < ROLL < 0.4 * whole
+    assert np.abs(wrong.shift_u).mean() < SHIFT and np.abs(wrong.shift_v).mean() < SHIFT
+    known = np.isfinite(aligned.sigma).all(axis=0)
+    assert tuple(np.flatnonzero(known)) == free
+
+
+class Killed(BaseException):
+    """Ends a call without giving it a chance to clean up."""
+
+
+def test_a_killed_alignment_goes_on_as_if_it_had_not_been(scan, aligned, tmp_path, monkeypatch):
+    save, done = Checkpoint.save, []
+
+    def saving(self, kept, values, arrays, volume=None):
+        save(self, kept, values, arrays, volume)
+        done.extend(["rigid"] * ("rigid" in values))
+        if len(done) == 5:  # in the middle of the second resolution, whose bias is known
+            raise Killed
+
+    monkeypatch.setattr(Checkpoint, "save", saving)
+    with pytest.raises(Killed):
+        clra.align(scan[0], estimate="rigid", quality=False, checkpoint=tmp_path / "kept")
+    stages = []
+    again = clra.align(
+        scan[0],
+        estimate="rigid",
+        quality=False,
+        checkpoint=tmp_path / "kept",
+        resume=True,
+        progress=lambda told: stages.append(told.stage),
+    )
+    assert again.motion == aligned.motion
+    assert np.array_equal(again.confidence, aligned.confidence)
+    assert [i.residual for i in again.history] == [i.residual for i in aligned.history]
+    assert not any("QR" in stage for stage in stages)  # the shifts are not looked for again
+
+
+def test_an_alignment_starts_from_rigid_motion(scan, aligned):
+    start = aligned.motion
+    shifted = clra.align(scan[0], estimate="shift", motion=start, quality=False).motion
+    assert np.allclose(shifted.rotation, start.rotation, atol=1e-9)
+    assert np.abs(shifted.shift_u - start.shift_u).mean() < 2 * SHIFT
+    by_imgr = clra.align(scan[0], "imgr", estimate="shift", motion=start, quality=False).motion
+    assert np.allclose(by_imgr.rotation, start.rotation, atol=1e-9)
+    with pytest.raises(InputError, match="found a rigid one with estimate='source'"):
+        clra.align(scan[0], estimate="source", motion=start)
+    with pytest.raises(InputError, match="found 'rigid' with method 'imgr', expected 'ra'"):
+        clra.align(scan[0], "imgr", estimate="rigid")
+
+
+def test_sigma_is_the_scatter_of_what_noise_does(scan):
+    """Of radiographs with white noise, against one volume."""
+    stream, geometry = Stream(None), scan[1]
+    images = scan[0].projections
+    still = clra.Scan(images, geometry)
+    grid, six = default_grid(geometry), (0, 1, 2, 3, 4, 5)
+    level = RigidLevel(stream, still, grid, Solver(), 1, six, np.zeros(6))
+    volume = level.reconstructed(level.radiographs, geometry, np.ones(VIEWS, np.bool_), "")
+    plain = level.registered(level.radiographs, volume, geometry, "")
+    errors, sigmas = [], []
+    for seed in range(3):
+        noise = 0.05 * images.max() * np.random.default_rng(seed).normal(size=images.shape)
+        noisy = clra.Scan((images + noise).astype(np.float32), geometry)
+        step = level.registered(Radiographs(stream, noisy, 1), volume, geometry, "")
+        errors.append(step.table - plain.table)
+        sigmas.append(step.sigma)
+    ratio = np.concatenate(errors).std(axis=0) / np.sqrt(np.mean(np.square(sigmas), axis=(0, 1)))
+    assert (ratio > 0.85).all() and (ratio < 1.2).all()

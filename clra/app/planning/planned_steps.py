@@ -1,0 +1,232 @@
+"""The steps of work on a cluster: tasks that are done before the next step begins."""
+
+import math
+import re
+from dataclasses import dataclass
+
+from clra.app.speed import Speed, exact_updates, views_a_voxel
+from clra.errors import InputError
+from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid, default_grid
+from clra.model.schedule import level_name, parse_schedule
+
+_WORKERS = re.compile(r"([1-9]\d{0,4})(?:x(.+))?")
+# A GPU that nobody has measured: half of the bound that tools/gpu_limits.py derives for an A100,
+# with 40 GiB.
+_GPU = Speed("a GPU, predicted", None, 2.9e-12, 3.2e-12, 1e-10, 5e-10, 5e-12, 2e-10)
+_GPU_BYTES = 40 << 30
+# Time to read and correct a pixel of a scan, on one core, beside the device's work [s].
+_READ_S = 7e-9
+# A view that sees two slabs is back-projected twice, which costs as much as this many voxels more
+# for each column of voxels: 95 on a CPU with 160 columns, 93 with 256.
+_COLUMN = 95
+# Shares of a device, as `clra.ops.streaming.memory.Budgets` has them.
+_USABLE, _SLAB = 0.75, 1 / 3
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Workers of one kind.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    speed : Speed
+        Of one.
+    slab_bytes : float
+        Of a slab of the volume at most.
+    cores_shared : bool
+        Whether they share this machine's cores: each is as much slower as there are others.
+    """
+
+    count: int
+    speed: Speed
+    slab_bytes: float
+    cores_shared: bool = False
+
+    @classmethod
+    def parse(cls, text: str, measured: Speed) -> "Workers":
+        """Read "8xGPU", "4xNAME" or "4".
+
+        Parameters
+        ----------
+        text : str
+            Number, and part of the name of the device here, or "GPU" for a predicted one.
+        measured : Speed
+            Of the device here.
+
+        Raises
+        ------
+        InputError
+            If it is none of these.
+        """
+        local = text.startswith("local:")
+        match = _WORKERS.fullmatch(text.removeprefix("local:"))
+        if match is None:
+            raise InputError(
+                f"--cluster: found {text!r}, expected a number of workers such as 8, local:4 for "
+                "processes on this machine, or 8xGPU"
+            )
+        count, name = int(match[1]), (match[2] or "").strip().lower()
+        if name == "gpu" and measured.device != _GPU.device:
+            return cls(count, _GPU, _SLAB * _USABLE * _GPU_BYTES)
+        if name not in measured.device.lower() or measured.budgets is None:
+            raise InputError(
+                f"--cluster: found {match[2] or 'no device'!r}, expected GPU or a part of the name "
+                f"of the device here, {measured.device}"
+            )
+        slab = measured.budgets.slab / (count if local else 1)
+        return cls(count, measured, slab, local)
+
+
+@dataclass(frozen=True)
+class PlannedStep:
+    """Tasks that are done before the next step begins.
+
+    Attributes
+    ----------
+    name : str
+        What they do.
+    tasks : int
+        How many.
+    seconds : float
+        Of one worker's device, for all of them.
+    read, written : float
+        Bytes of files, of all of them.
+    """
+
+    name: str
+    tasks: int
+    seconds: float
+    read: float
+    written: float
+
+
+def steps_of_work(
+    geometry: ConeBeamGeometry, workers: Workers
+) -> list[tuple[str, list[PlannedStep], int]]:
+    """Return pieces of work: name, steps, and how many views are registered.
+
+    A reconstruction at full resolution, and an alignment by the default schedule.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the scan.
+    workers : Workers
+        Who does it.
+    """
+    from clra.methods.alignment.options import Solver
+
+    grid = default_grid(geometry)
+    work = [("fbp, full resolution", [_planes(geometry, grid, workers)], 0)]
+    if not math.isnan(workers.speed.exact_back) and _is_helical(geometry):
+        exact = _planes(geometry, grid, workers, exact=True)
+        work.append(("katsevich, full resolution", [exact], 0))
+    steps: list[PlannedStep] = []
+    names, registered = [], 0
+    for stage in parse_schedule("auto", geometry.shape):
+        iterations = stage.iterations or 1  # where "until converged" mostly ends
+        if stage.level > 1:
+            steps.append(_binning(geometry, stage.level, workers))
+        # What displaces the re-projections of small images is found by an iteration with them.
+        more = Solver().is_biased(geometry.binned(stage.level) if stage.level > 1 else geometry)
+        steps += (iterations + more) * _iteration(geometry, grid, stage.level, workers)
+        registered += iterations * geometry.views
+        names.append(f"{iterations}{level_name(stage.level)}")
+    work.append((f"align, {'-'.join(names)}", steps, registered))
+    return work
+
+
+def _planes(
+    geometry: ConeBeamGeometry, grid: VolumeGrid, workers: Workers, *, exact: bool = False
+) -> PlannedStep:
+    """Planes of a volume, as `clra.methods.execution.executor.reconstruct_planes` cuts them."""
+    from clra.methods.execution.executor import slabs_of
+
+    tasks = len(slabs_of(workers.count, workers.slab_bytes, grid.shape))
+    seen = _views_of_slabs(geometry, grid, tasks)
+    pixels = seen * geometry.rows * geometry.columns
+    speed = workers.speed
+    if exact:
+        seconds = exact_updates(geometry, grid) * speed.exact_back + pixels * speed.exact_filtering
+    else:
+        updates = math.prod(grid.shape) * views_a_voxel(geometry, grid)
+        seconds = updates * speed.back + pixels * speed.filtering
+        seconds += _COLUMN * (seen - geometry.views) * math.prod(grid.shape[1:]) * speed.back
+    seconds += pixels * _READ_S
+    # What workers write the client reads again, and writes into the output.
+    return PlannedStep("planes", tasks, seconds, 4.0 * pixels + _bytes(grid), 2.0 * _bytes(grid))
+
+
+def _binning(geometry: ConeBeamGeometry, level: int, workers: Workers) -> PlannedStep:
+    from clra.methods.execution.shared_level import view_chunks
+
+    stored = 4.0 * geometry.views * geometry.rows * geometry.columns
+    tasks = len(view_chunks(workers.count, geometry.views))
+    return PlannedStep("binning", tasks, stored / 4 * _READ_S, stored, stored / level**2)
+
+
+def _iteration(
+    geometry: ConeBeamGeometry, full: VolumeGrid, level: int, workers: Workers
+) -> list[PlannedStep]:
+    """Return the steps of an iteration, as `SharedLevel` has them."""
+    from clra.methods.alignment.options import Solver
+    from clra.methods.alignment.reprojection import with_margin
+    from clra.methods.execution.executor import slabs_of
+    from clra.methods.execution.level_tasks import planned_volumes
+    from clra.methods.execution.shared_level import view_chunks
+
+    terms = Solver().terms
+    binned = geometry.binned(level) if level > 1 else geometry
+    grid = with_margin(full)
+    grid = grid.binned(level) if level > 1 else grid
+    slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, planned_volumes(terms))
+    chunks = len(view_chunks(workers.count, geometry.views))
+    seen = _views_of_slabs(binned, grid, len(slabs))
+    view = float(binned.rows * binned.columns)
+    updates = math.prod(grid.shape) * views_a_voxel(binned, grid)
+    speed = workers.speed
+    again = max(0.0, seen - binned.views) * math.prod(grid.shape[1:])
+    back = (updates + _COLUMN * again) * speed.back + seen * view * speed.filtering
+    forward = updates * speed.forward
+    # Each chunk of views reads the slabs that it sees.
+    looked = chunks * math.ceil(len(slabs) * min(1.0, seen / len(slabs) / binned.views) + 1)
+    looked = min(looked, chunks * len(slabs))
+    volume, images = _bytes(grid), 4.0 * binned.views * view
+    fetched = volume * looked / len(slabs)
+    steps = [PlannedStep("reconstructing", len(slabs), back, 4 * seen * view, volume)]
+    for _ in range(terms):
+        steps += [
+            PlannedStep("simulating", chunks, forward, fetched + images, images),
+            PlannedStep("correcting", len(slabs), back, 4 * seen * view + volume, volume),
+        ]
+    registering = binned.views * view * speed.registering
+    return [
+        *steps,
+        PlannedStep("registering", chunks, forward + registering, fetched + images, 0.0),
+    ]
+
+
+def _views_of_slabs(geometry: ConeBeamGeometry, grid: VolumeGrid, slabs: int) -> float:
+    """Add up the views that see each of some slabs: so many are read and filtered."""
+    from clra.model.view_selection import views_that_see
+    from clra.ops.streaming.stream import equal_runs
+
+    parts = equal_runs(grid.shape[0], min(slabs, grid.shape[0]))
+    return float(sum(views_that_see(geometry, grid.slab(p.start, p.stop)).sum() for p in parts))
+
+
+def _is_helical(geometry: ConeBeamGeometry) -> bool:
+    from clra.model.helix.fit import fit_helices
+
+    try:
+        fit_helices(geometry)
+    except InputError:
+        return False
+    return True
+
+
+def _bytes(grid: VolumeGrid) -> float:
+    return 4.0 * math.prod(grid.shape)

@@ -1,0 +1,75 @@
+"""The executor that a call asks for."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import pyopencl as cl
+
+from clra.errors import InputError
+from clra.methods.execution.checkpoint import Checkpoint
+from clra.methods.execution.clusters import check_cluster, on_cluster
+from clra.methods.execution.executor import Executor, InProcess
+from clra.methods.execution.several_devices import SeveralDevices
+from clra.methods.execution.travelling import check_travels
+from clra.model.scan import Scan
+from clra.ops.streaming.stream import Stream
+from clra.progress import ProgressCallback
+
+
+@contextmanager
+def executing(
+    stream: Stream,
+    devices: Sequence[cl.Device],
+    cluster: Any,
+    scan: Scan,
+    checkpoint: Checkpoint | None,
+    progress: ProgressCallback | None,
+    limits: dict[str, Any],
+) -> Iterator[Executor]:
+    """Yield a cluster if there is one, else several devices, else this process on its device.
+
+    Parameters
+    ----------
+    stream : Stream
+        Of the only device.
+    devices : sequence of cl.Device
+        Of this machine.
+    cluster, scan, checkpoint, progress, limits
+        As for :func:`clra.methods.execution.clusters.on_cluster`; None is no cluster.
+    """
+    if cluster is not None:
+        with on_cluster(cluster, scan, checkpoint, progress, limits) as executor:
+            yield executor
+    elif len(devices) > 1:
+        yield SeveralDevices(devices, progress=progress, **limits)
+    else:
+        yield InProcess(stream)
+
+
+def check_for_cluster(cluster: Any, scan: Scan, what: str, supported: Sequence[str]) -> None:
+    """Refuse, before anything is begun, what a cluster cannot do.
+
+    Parameters
+    ----------
+    cluster : distributed.Client, str or None
+        None is no cluster.
+    scan : Scan
+        To be read by workers.
+    what : str
+        What is asked for.
+    supported : sequence of str
+        What may be asked for.
+
+    Raises
+    ------
+    InputError
+        If it is none of these, or as :func:`clra.methods.execution.clusters.on_cluster` does.
+    """
+    if cluster is None:
+        return
+    check_cluster(cluster)
+    if what not in supported:
+        listed = ", ".join(map(repr, supported))
+        raise InputError(f"cluster: found {what!r}, expected one of {listed} on a cluster")
+    check_travels(scan)

@@ -1,0 +1,95 @@
+"""What a reconstruction tells of the scan it is made from."""
+
+import numpy as np
+
+from clra.errors import InputError
+from clra.findings import Finding
+from clra.methods.assessment.axis_of_arc import axis_offset
+from clra.methods.assessment.radiograph_checks import radiograph_findings
+from clra.methods.assessment.slice_sharpness import VIEWS, sharpening_by_opposite_rotation
+from clra.methods.diagnostics import doubted_rotation
+from clra.methods.truncation import truncated
+from clra.model.detector_pose import steep_rows
+from clra.model.motion import Motion
+from clra.model.sampling.angular_coverage import covered, is_circle, part_of_a_turn
+from clra.model.sampling.field_of_view import is_offset
+from clra.model.scan import Scan
+from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.stream import Stream
+
+# Most columns that the axis is looked for in.
+_COLUMNS = 200
+# Offset of the axis from which on slices show it [pixel], and how much better rays along the same
+# line have to agree then: noise and jitter of some pixels end at 1.1.
+_OFFSET, _AGREE = 1.5, 1.5
+
+
+def warn_of_method(stream: Stream, scan: Scan, method: str) -> None:
+    """Warn of what a method makes less of than a scan's users may think.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        To be reconstructed.
+    method : str
+        Of reconstruction.
+    """
+    notes = {}
+    if method == "fbp":
+        notes["short-scan"] = part_of_a_turn(scan.geometry)
+        notes["cone-angle"] = steep_rows(scan.geometry)
+    if method != "katsevich":  # that refuses such samples
+        notes["truncation"] = truncated(Radiographs(stream, scan, 1), scan.geometry)
+    for code, note in notes.items():
+        if note:
+            Finding(code, note).warn()
+
+
+def warn_of_scan(stream: Stream, scan: Scan, motion: Motion | None) -> None:
+    """Warn of what an alignment would have told of a scan: defects, rotation sense, axis.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        Some of its radiographs are read.
+    motion : Motion, optional
+        Of its views, as far as known.
+    """
+    told = [f for f in radiograph_findings(scan) if f.code not in ("truncation", "limited-arc")]
+    motion = motion or Motion.identity(scan.views)
+    # Slices with the axis elsewhere may well be sharper the other way round.
+    found = _axis_elsewhere(stream, scan, motion)
+    if found is None:
+        sharper = sharpening_by_opposite_rotation(stream, scan, motion)
+        found = doubted_rotation(sharper) if sharper == sharper else None
+    for finding in [*told, *([found] if found else [])]:
+        finding.warn()
+
+
+def _axis_elsewhere(stream: Stream, scan: Scan, motion: Motion) -> Finding | None:
+    """Look for another column of the axis, where rays are measured twice."""
+    if not is_circle(scan.geometry) or covered(scan.geometry) < np.pi or is_offset(scan.geometry):
+        return None
+    chosen = slice(0, None, max(1, scan.views // VIEWS))
+    part = scan.subset(chosen)
+    geometry = part.geometry.with_motion(motion.subset(chosen))
+    pixel = next((n for n in (1, 2, 4) if scan.geometry.columns // n <= _COLUMNS), 8)
+    binned = Scan(Radiographs(stream, part, pixel), geometry.binned(pixel))
+    try:
+        offset, gain = axis_offset(stream, binned)
+    except InputError:
+        return None  # hardly a ray is measured twice
+    offset *= pixel
+    if abs(offset) < _OFFSET or gain < _AGREE:
+        return None
+    return Finding(
+        "axis-offset",
+        f"rays that are measured twice agree better by a factor of {gain:.1f} if the axis is seen "
+        f"{offset:+.1f} columns from where the geometry has it",
+        "give it (--centre-offset), or align the scan",
+        measured={"offset": offset, "gain": gain},
+    )
