@@ -111,7 +111,7 @@ def _local(workers: int) -> Iterator[Any]:
             threads_per_worker=1,
             processes=True,
             memory_limit=None,  # clra keeps to its own budgets
-            dashboard_address=None,
+            dashboard_address=":0",
             silence_logs=logging.ERROR,
             local_directory=folder,
         ) as cluster:
