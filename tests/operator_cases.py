@@ -203,7 +203,7 @@ CASES = {
     ),
     "rigid registration": Case(
         lambda c, **a: RigidRegistration(c, IMAGES[1:], views=VIEWS, high_pass=4.0, **a),
-        (VIEWS, 36),
+        (VIEWS, 3, 36),
         (*PAIR, values(*IMAGES), rigid_table(GEOMETRY)),
         closeness=REGISTERED,
     ),

@@ -26,6 +26,7 @@ COMMANDS = {
     "figure3": "reproduce_figure3.py --scale 4 --schedules 1QR-1HR,2QR-2HR,auto -o FOLDER",
     "figure3-full": "reproduce_figure3.py --scale 1 --schedules 1QR-1HR,auto -o FOLDER",
     "ablation": "reproduce_figure3.py --scale 4 --ablation -o FOLDER",
+    "real": "real_scan.py --seeds 101 102 103 104 105 106 107 108 109 110 -o FOLDER",
     "rock": "rock.py --scale 4 -o FOLDER",
     "registration": "registration_table.py",
     "bad-views": "bad_views.py --seeds 3 -o FOLDER",
@@ -36,6 +37,7 @@ COMMANDS = {
     "wood": "figure4_small.py --scale 16 -o FOLDER",
     "imgr": "imgr_small.py",
     "memory": "memory_peaks.py",
+    "cluster": "cluster_table.py",
     "gpu": "check_gpu.py --only limits",
     "bench": "bench.py --peer rtk --long",
 }

@@ -41,6 +41,8 @@ Floats = NDArray[np.float64]
 # Displacement that no motion explains, and magnification, beyond which the reported geometry is
 # another scan's [pixel, factor].
 _BEYOND, _SCALED = 3.0, 1.2
+# Views below which nothing is said of how their errors differ.
+_ENOUGH = 60
 # Variance of the logarithm of a length whose two components are normal and alike in all views.
 _OF_EQUAL = np.pi**2 / 24
 
@@ -127,7 +129,7 @@ def _uncertainty(case: Case, result: Any) -> dict[str, float]:
     for axis, name in enumerate("uvm"):
         if known[axis]:
             measured[f"ratio_{name}"] = float(sizes[0][axis] / sizes[1][axis])
-    if known[:2].all():
+    if known[:2].all() and len(wrong) >= _ENOUGH:
         lengths = [
             np.hypot(*(table[:, :2] / size[:2]).T)
             for table, size in zip((wrong, sigma), sizes, strict=True)

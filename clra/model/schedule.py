@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 
 from clra.errors import InputError
 
-_LEVELS = {"FR": 1, "HR": 2, "QR": 4, "ER": 8}
-_STAGE = re.compile(r"([1-9][0-9]?)([FHQE]R)")
+_LEVELS = {"FR": 1, "HR": 2, "QR": 4, "ER": 8, "SR": 16}
+_STAGE = re.compile(r"([1-9][0-9]?)([FHQES]R)")
 _EXPECTED = (
     "expected 'auto' or stages such as '1QR-1HR' or '4FR': a number of iterations (1 to 99) at "
-    "full (FR), half (HR), quarter (QR) or eighth (ER) resolution, joined by '-'"
+    "full (FR), half (HR), quarter (QR), eighth (ER) or sixteenth (SR) resolution, joined by '-'"
 )
 
 # "auto" begins at an eighth of the resolution where the detector's shorter side keeps this many
@@ -55,7 +55,7 @@ class Stage:
     Parameters
     ----------
     level : int
-        Binning factor: 1, 2, 4 or 8.
+        Binning factor: 1, 2, 4, 8 or 16.
     iterations : int or None
         How many; None to iterate until `converged`.
     limit : int
@@ -78,7 +78,7 @@ class Stage:
 
 
 def level_name(level: int) -> str:
-    """Return "FR", "HR", "QR" or "ER" for the binning factors 1, 2, 4 and 8."""
+    """Return "FR", "HR", "QR", "ER" or "SR" for the binning factors 1, 2, 4, 8 and 16."""
     for name, factor in _LEVELS.items():
         if factor == level:
             return name
@@ -86,7 +86,7 @@ def level_name(level: int) -> str:
 
 
 def level_factor(name: str) -> int:
-    """Return the binning factor of "FR", "HR", "QR" or "ER"."""
+    """Return the binning factor of "FR", "HR", "QR", "ER" or "SR"."""
     return _LEVELS[name]
 
 

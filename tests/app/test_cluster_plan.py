@@ -14,7 +14,7 @@ from clra.ops.runtime.devices import choose_device
 from clra.ops.streaming.memory import Budgets
 
 SPEED = Speed("a device", None, back=1e-9, forward=2e-9, filtering=1e-8, registering=3e-8)
-FREE = Site(file_system=1e30, link=1e30, begin_s=0.0, task_s=0.0, view_s=0.0)
+FREE = Site(file_system=1e30, link=1e30, start_s=0.0, begin_s=0.0, task_s=0.0, view_s=0.0)
 
 
 def workers(count, **changes):

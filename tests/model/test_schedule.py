@@ -12,6 +12,7 @@ from clra.model.schedule import Stage, converged, level_name, parse_schedule, up
         ("1QR-1HR", [(4, 1, 1), (2, 1, 1)]),
         ("2qr-12hr", [(4, 2, 2), (2, 12, 12)]),
         ("4FR", [(1, 4, 4)]),
+        ("3SR-2ER", [(16, 3, 3), (8, 2, 2)]),
         ("2ER-1QR-1HR-3FR", [(8, 2, 2), (4, 1, 1), (2, 1, 1), (1, 3, 3)]),
         ("auto", [(8, 4, 4), (4, None, 20, 0.02, 0.003), (2, None, 6, 0.05, 0.003)]),
     ],
@@ -48,7 +49,7 @@ def test_bad_text_says_what_a_schedule_looks_like(text):
 def test_stages_print_as_they_are_written():
     assert "-".join(str(stage) for stage in parse_schedule("2ER-1QR-3FR")) == "2ER-1QR-3FR"
     assert [str(stage) for stage in parse_schedule("auto")] == ["4ER", "QR", "HR"]
-    assert [level_name(level) for level in (1, 2, 4, 8)] == ["FR", "HR", "QR", "ER"]
+    assert [level_name(level) for level in (1, 2, 4, 8, 16)] == ["FR", "HR", "QR", "ER", "SR"]
     with pytest.raises(ValueError, match="level: found 3"):
         level_name(3)
 

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from clra.app.console import Console, Memory, Reading
+from clra.findings import warn
 
 
 def report(
@@ -55,4 +56,6 @@ def report(
     if show:
         import webbrowser
 
-        webbrowser.open(out.absolute().as_uri())
+        page = out.absolute().as_uri()
+        if not webbrowser.open(page):
+            warn("no-browser", f"found no browser here, open {page} in one")

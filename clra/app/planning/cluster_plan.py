@@ -20,8 +20,9 @@ class Site:
         Bytes a second that one worker gets of it at most.
     task_s : float
         Time that the client and the scheduler take for a task [s]; 3 ms of processor time measured.
-    begin_s : float
-        Time that a worker takes to begin a task: files, tables; 0.1 s of processor time measured.
+    start_s, begin_s : float
+        Time that a worker takes to begin with the work, and with each task: kernels, files, tables;
+        0.7 s and 0.1 s of processor time measured.
     view_s : float
         Time that the client takes for a view in an iteration: gauge and stop rule [s].
     task_bytes, view_bytes : float
@@ -31,6 +32,7 @@ class Site:
     file_system: float = 2e9
     link: float = 1e9
     task_s: float = 6e-3
+    start_s: float = 0.7
     begin_s: float = 0.1
     view_s: float = 2e-4
     task_bytes: float = 2.5e3
@@ -112,8 +114,8 @@ def simulated(steps: Sequence[PlannedStep], workers: Workers, site: Site) -> flo
     float
         Seconds.
     """
-    now = 0.0
     slower = workers.count if workers.cores_shared else 1
+    now = slower * site.start_s
     for step in steps:
         busy = min(workers.count, step.tasks)
         rate = min(site.link, site.file_system / busy)

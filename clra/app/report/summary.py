@@ -281,10 +281,10 @@ def _hardly_determined(quality: Quality) -> dict[str, str]:
         return {}
     told = (
         f"{m.name} {m.amplitude:.2f}"
-        + (f" +- {m.sigma:.2f}" if math.isfinite(m.sigma) else ", not determined")
+        + (f" +- {m.sigma:.2f} pixel" if math.isfinite(m.sigma) else " pixel, not determined")
         for m in modes
     )
-    return {"hardly determined": f"{'; '.join(told)} pixel rms"}
+    return {"hardly determined": "; ".join(told)}
 
 
 def _unobservable(result: AlignmentResult) -> str:

@@ -64,6 +64,8 @@ class ScannerOptions:
     def __post_init__(self) -> None:
         if self.rotation not in (None, "ccw", "cw"):
             raise InputError.at("--rotation", "rotation", repr(self.rotation), "ccw or cw")
+        if self.source_distance is not None:  # behind the axis, NeXus has it negative
+            object.__setattr__(self, "source_distance", abs(self.source_distance))
         for name in ("source_distance", "detector_distance", "white"):
             value = getattr(self, name)
             if value is not None and not value > 0:

@@ -83,6 +83,10 @@ def align(
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
         detector of 384 pixels and more "6ER-3QR", else a quarter of the resolution
         until converged (at most 20 iterations), then half until converged (at most 3, often one).
+        Where the motion is large, or the views are an arc of a parallel beam, "auto" begins with
+        shifts by sums over the radiographs ("PA" in the history), and on other arcs with the column
+        of the axis, if the rays that are measured twice tell one; ``Solver(prealign=False)``
+        leaves both out.
         For "imgr" the levels of a cycle: "QR-HR-FR" ("auto") or "ER-QR-HR-FR".
     estimate : {"shift+scale", "shift", "source", "rigid", "shift+roll", "shift+scale+roll"}
         Whether the magnification of each view is estimated or taken as 1; or whether it is the

@@ -47,10 +47,12 @@ def far_motion(found: Motion, level: int) -> str:
     at_end = int(np.count_nonzero(farthest >= _AT_END * reach))
     if at_end <= _TOO_MANY * found.views:
         return ""
+    levels = [level_name(factor) for factor in (16, 8, 4, 2) if factor <= max(2 * level, 4)]
+    coarser = "-".join(f"2{name}" for name in levels[:3])
     return (
         f"{at_end} of {found.views} views moved by {_AT_END * reach:.0f} pixels or more: "
         f"registration at {level_name(level)} looks no farther than {reach:.0f}; start with a "
-        "coarser level (such as 2ER-2QR-1HR) or from a motion"
+        f"coarser level (such as {coarser}) or from a motion"
     )
 
 

@@ -60,7 +60,8 @@ class Solver:
     prealign : bool
         Begin schedule "auto" with shifts by sums over the radiographs, where the motion is large or
         the scan an arc of a parallel beam, whose slow modes they tell better than re-projections,
-        see :func:`clra.methods.alignment.prealignment.prealignment.prealigned`.
+        see :func:`clra.methods.alignment.prealignment.prealignment.prealigned`; on other arcs with
+        the column of the axis.
     """
 
     estimator: str = "gauss-newton"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -93,6 +94,7 @@ def assess(
     nudged = predicted(
         aligned.motion, False, "with a known motion", _motion(scan.views, views, put_in)
     )
+    slow = float(np.sqrt(np.mean(slow_part(left[views, 2]) ** 2)))
     quality = Quality(
         verdict="good",
         level=held_out.level,
@@ -101,7 +103,8 @@ def assess(
         shift_before=_rms(gauge.of(before)),
         shift_after=_rms(left),
         error=float(_MEAN * spread.max()),
-        slow_magnification=float(np.sqrt(np.mean(slow_part(left[views, 2]) ** 2))),
+        slow_magnification=slow,
+        distortion=slow * float(np.hypot(*scan.geometry.shape)) / math.sqrt(12),
         sharpness=after.sharpness / before.sharpness if before.sharpness else 1.0,
         kept_start=kept_start,
         residual=tuple(after.residual.tolist()),

@@ -22,7 +22,7 @@ _UNEXPLAINED, _HOPELESS = 0.2, 0.5
 _FEW = 40
 # Slow error of the magnification from which on a result is doubtful. In good scans of
 # `tools/stress.py` up to 0.003 are found, 0.007 in wood; where slow shifts of 30 pixels bend the
-# volume, 0.01 to 0.024.
+# volume, 0.01 to 0.024. It has to displace what the detector sees as well.
 _MAGNIFIED = 0.009
 
 
@@ -52,6 +52,8 @@ class Quality:
         Expected mean absolute error, the larger one of u and v [pixel].
     slow_magnification : float
         RMS of what is left of the magnification below four cycles a scan.
+    distortion : float
+        RMS over the detector of the displacement by it [pixel].
     sharpness : float
         Mean squared gradient of the volume after, relative to before.
     kept_start : bool
@@ -74,6 +76,7 @@ class Quality:
     shift_after: tuple[float, float, float] = (0.0, 0.0, 0.0)
     error: float = 0.0
     slow_magnification: float = 0.0
+    distortion: float = 0.0
     sharpness: float = 1.0
     kept_start: bool = False
     residual: tuple[float, ...] = ()
@@ -155,7 +158,7 @@ def judged(quality: Quality, views: int) -> Quality:
                 measured={"residual": unexplained, "before": quality.residual_before},
             )
         )
-    if quality.slow_magnification > _MAGNIFIED:
+    if quality.slow_magnification > _MAGNIFIED and quality.distortion > _DOUBTFUL:
         grade = max(grade, 1)
         reasons.append(
             Finding(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -63,13 +63,8 @@ class SoftMode:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON; an uncertainty that is not known is None there."""
-        sigma = round(self.sigma, 5) if math.isfinite(self.sigma) else None
-        return {
-            "name": self.name,
-            "amplitude": round(self.amplitude, 5),
-            "seen": round(self.seen, 3),
-            "sigma": sigma,
-        }
+        sigma = self.sigma if math.isfinite(self.sigma) else None
+        return {**asdict(self), "sigma": sigma}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> SoftMode:
@@ -170,7 +165,9 @@ class Modes:
                 shown = abs(self._along(left, shape))
                 amplitude = gauge.get(name, abs(self._along(values, shape)))
             sigma = float(shown) / seen if seen >= _LEAST else math.inf
-            modes.append(SoftMode(name, float(amplitude), seen, sigma))
+            modes.append(
+                SoftMode(name, round(float(amplitude), 5), round(seen, 3), round(sigma, 5))
+            )
         return tuple(modes)
 
     def _along(self, table: Floats, shape: Floats) -> float:

@@ -1,10 +1,10 @@
 """Which cluster is meant: a client of Dask, or a text that says how to get one."""
 
 import logging
-import os
 import re
 import shutil
 import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -111,7 +111,7 @@ def _local(workers: int) -> Iterator[Any]:
             threads_per_worker=1,
             processes=True,
             memory_limit=None,  # clra keeps to its own budgets
-            dashboard_address=None,
+            dashboard_address=":0",
             silence_logs=logging.ERROR,
             local_directory=folder,
         ) as cluster:
@@ -142,6 +142,6 @@ def _slurm(jobs: int) -> Iterator[Any]:
 def _folder(checkpoint: Checkpoint | None) -> Path:
     """Where the workers' files go."""
     if checkpoint is None:
-        return Path(f"clra-{os.getpid()}.tasks")
+        return Path(f"clra-{uuid.uuid4().hex[:8]}.tasks")
     kept = checkpoint.folder
     return kept.with_name(f"{kept.name.removesuffix('.resume')}.tasks")

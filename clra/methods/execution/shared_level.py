@@ -33,7 +33,7 @@ from clra.ops.streaming.stream import equal_runs
 from clra.progress import ProgressCallback
 
 # Views of a task at most: what a worker that is killed loses, and what one keeps on its host.
-_MOST_VIEWS = 256
+_MOST_VIEWS = 1024
 
 
 @dataclass

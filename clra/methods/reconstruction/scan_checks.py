@@ -17,6 +17,8 @@ from clra.model.scan import Scan
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
+# Most columns that the axis is looked for in.
+_COLUMNS = 200
 # Offset of the axis from which on slices show it [pixel], and how much better rays along the same
 # line have to agree then: noise and jitter of some pixels end at 1.1.
 _OFFSET, _AGREE = 1.5, 1.5
@@ -74,11 +76,14 @@ def _axis_elsewhere(stream: Stream, scan: Scan, motion: Motion) -> Finding | Non
         return None
     chosen = slice(0, None, max(1, scan.views // VIEWS))
     part = scan.subset(chosen)
-    moved = Scan(part.projections, part.geometry.with_motion(motion.subset(chosen)), part.kind)
+    geometry = part.geometry.with_motion(motion.subset(chosen))
+    pixel = next((n for n in (1, 2, 4) if scan.geometry.columns // n <= _COLUMNS), 8)
+    binned = Scan(Radiographs(stream, part, pixel), geometry.binned(pixel))
     try:
-        offset, gain = axis_offset(stream, moved)
+        offset, gain = axis_offset(stream, binned)
     except InputError:
         return None  # hardly a ray is measured twice
+    offset *= pixel
     if abs(offset) < _OFFSET or gain < _AGREE:
         return None
     return Finding(

@@ -67,6 +67,8 @@ class RigidRegistration:
         Of scratch memory.
     total_weight : float
         Sum of W.
+    blocks : int
+        Bands of rows whose sums are kept apart.
     """
 
     def __init__(
@@ -101,9 +103,9 @@ class RigidRegistration:
         self.total_weight = float(weights.sum())
         self._weights = to_device(context, weights)
         self._box = box(weights)
-        self._blocks = -(-(self._box[1] - self._box[0]) // _BLOCK_ROWS)
+        self.blocks = -(-(self._box[1] - self._box[0]) // _BLOCK_ROWS)
         self._images, self._banded = (memory.empty((views, IMAGES, *shape)) for _ in range(2))
-        self._sums = memory.empty((views, self._blocks, self._strands, PRODUCTS))
+        self._sums = memory.empty((views, self.blocks, self._strands, PRODUCTS))
         defines = {"LANES": 8 if cpu else 1}
         self._derivatives, self._products, self._totals = (
             Step(context, "rigid_registration.cl", name, local, defines)
@@ -133,8 +135,9 @@ class RigidRegistration:
         queue : cl.CommandQueue
             In order or out of order.
         totals_out : cl.array.Array
-            float32 (n, 36), overwritten: the upper triangle, row by row, of the products of the six
-            derivatives [attenuation per mm or rad], the simulated radiograph and the difference.
+            float32 (n, blocks, 36), overwritten: the upper triangle, row by row, of the products of
+            the six derivatives [attenuation per mm or rad], the simulated radiograph and the
+            difference, summed up over each band of rows.
         measured, simulated, over_depth : cl.array.Array
             float32 (n, rows, columns): measured and simulated line integrals, and integrals of the
             volume over the depth.
@@ -159,7 +162,7 @@ class RigidRegistration:
         for name, array in (("simulated", simulated), ("over_depth", over_depth)):
             check_array(name, array, (n, *self.shape), context=self._context)
         check_array("views", views, (n, TABLE), context=self._context)
-        check_array("totals_out", totals_out, (n, PRODUCTS), context=self._context)
+        check_array("totals_out", totals_out, (n, self.blocks, PRODUCTS), context=self._context)
         rows, columns = self.shape
         event = self._derivatives(
             queue,
@@ -176,16 +179,16 @@ class RigidRegistration:
         )
         event = self._products(
             queue,
-            (self._strands, self._blocks, n),
+            (self._strands, self.blocks, n),
             *(self._sums, self._banded, self._weights, columns, rows),
             *self._box,
-            *(_BLOCK_ROWS, self._blocks, self._strands, n),
+            *(_BLOCK_ROWS, self.blocks, self._strands, n),
             wait_for=[event],
         )
         event = self._totals(
             queue,
-            (PRODUCTS, n),
-            *(totals_out, self._sums, self._blocks * self._strands, n),
+            (PRODUCTS, n * self.blocks),
+            *(totals_out, self._sums, self._strands, n * self.blocks),
             wait_for=[event],
         )
         self._last = [event]

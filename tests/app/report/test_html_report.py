@@ -182,3 +182,13 @@ def test_a_rigid_motion_has_its_six_curves_and_numbers():
     values, text = summary_of(result, None)
     assert values["rigid"]["about v [degree]"]["rms"] == pytest.approx(0.5)
     assert "0.000, 0.500, 0.000 degrees rms" in text
+
+
+@pytest.mark.filterwarnings("default")
+def test_the_page_is_shown_where_there_is_a_browser(clra, motion_file, tmp_path, monkeypatch):
+    page, shown = tmp_path / "r.html", []
+    for there in (True, False):
+        monkeypatch.setattr("webbrowser.open", lambda url, t=there: shown.append(url) or t)
+        status, _, error = clra("report", motion_file, "-o", page, "--open", "-q")
+        assert status == 0 and ("found no browser here" in error) == (not there)
+    assert shown == 2 * [page.as_uri()]

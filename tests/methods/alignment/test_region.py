@@ -63,3 +63,9 @@ def test_the_grid_is_as_high_as_the_sample_is_seen(half_height):
     else:
         assert top > highest + half_detector
         assert 2 * region.grid.centre[2] == pytest.approx(lowest + highest, abs=0.1)
+
+
+@pytest.mark.parametrize(("arc", "terms"), [(360, 1), (200, 3), (140, 3)])
+def test_an_arc_needs_more_corrections(arc, terms):
+    region, _ = _region(clra.circular(40, arc=math.radians(arc), **DETECTOR), (1.5, 1.5, 1.0))
+    assert region.terms(1) == terms and region.terms(0) == 0

@@ -32,7 +32,7 @@ def client(tmp_path_factory):
             n_workers=2,
             threads_per_worker=1,
             memory_limit=None,
-            dashboard_address=None,
+            dashboard_address=":0",
             silence_logs=50,
             local_directory=str(folder),
         ) as cluster,

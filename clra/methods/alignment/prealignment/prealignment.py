@@ -44,9 +44,10 @@ _KNOWN, _LOST = 0.03, 0.1
 # Robust standard deviations by which a view's mass may differ from the others', and what may differ
 # in any case, a part of it.
 _OUTLYING, _SLIGHT = 5.0, 1e-3
-# Where they are known, a shift that is registered this far aside is wrong [pixel]: single ones err
-# by 0.02. And by how much the slow modes are damped: a few views in a row may well be unknown.
-_ASIDE, _DAMPING = 0.5, 0.01
+# Where slow modes are known, a shift that is registered this far aside is wrong [pixel]: single
+# ones err by 0.02, and those of views that are cut off by 2. And by how much the slow modes are
+# damped: a few views in a row may well be unknown.
+_ASIDE, _FAR, _DAMPING = 0.5, 3.0, 0.01
 # Most columns of radiographs whose sums are to be exact.
 _COLUMNS = 512
 # Rows per height of the axis may differ by this part, and columns of its image by this part of the
@@ -116,7 +117,8 @@ class Prealignment:
             if known.any():
                 beside = beside - slow_part(beside, known.astype(float), _DAMPING)
                 if axis < 2:
-                    beside[known & (self.exact[axis] | (np.abs(beside) > _ASIDE))] = 0.0
+                    limit = np.where(known, 0.0 if self.exact[axis] else _ASIDE, _FAR)
+                    beside[np.abs(beside) > limit] = 0.0
             columns.append(told + beside)
         return Motion(
             shift_u=columns[0],

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.region import region_of
+from clra.methods.alignment.reprojection import used_pixels
 from clra.methods.alignment.result import AlignmentResult
-from clra.methods.assessment.held_out import HeldOut, Predicted
+from clra.methods.assessment.held_out import HeldOut
 from clra.methods.assessment.quality import Quality
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.gauge.gauge import Gauge, sample_points
@@ -15,6 +16,7 @@ from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
+from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -51,31 +53,12 @@ def standard_errors(
     """
     quality, motion = judged.quality, found.motion
     assert isinstance(quality, Quality) and isinstance(motion, RigidMotion)
-    region = region_of(stream, scan, default_grid(scan.geometry))
-    held_out = HeldOut(stream, scan, region.grid)
-    level = held_out.level
-    radiographs, views = held_out.radiographs(found.valid_views)
-    geometry = scan.geometry.subset(views).with_motion(motion.subset(views)).binned(level)
-    stage = "held-out views, simulated"
-    volume = fitted_fbp(
-        stream,
-        radiographs,
-        geometry,
-        region.grid.binned(level) if level > 1 else region.grid,
-        positive=True,
-        terms=1,
-        used=np.ones(geometry.shape, np.bool_),
-        valid_views=np.ones(len(views), np.bool_),
-        circle=not region.truncated,
-        stage=stage,
-    )
-    still = reprojections(stream, volume, geometry, level, stage)
-    del volume
-    usual = _apparent(
-        scan,
-        held_out.predict(still, views, motion, magnification=scale, whole=True, stage=stage),
-        scale,
-    )
+    held_out = HeldOut(stream, scan, default_grid(scan.geometry))
+    # Twice as fine: radiographs hold more than the pixels they are compared in.
+    factor = max(1, held_out.level // 2)
+    views = held_out.chosen(found.valid_views)
+    still = _simulated(stream, scan.subset(views), motion.subset(views), factor)
+    usual = factor * _apparent(stream, still, scale)
     seen = np.array(quality.shift_after[:2])
     beyond = np.sum(np.maximum(seen**2 - (_USUAL * usual) ** 2, 0.0))
     sigma, valid = found.sigma.copy(), found.valid_views
@@ -88,12 +71,42 @@ def standard_errors(
     return sigma
 
 
-def _apparent(scan: Scan, predicted: Predicted, scale: bool) -> Floats:
+def _simulated(stream: Stream, scan: Scan, motion: RigidMotion, factor: int) -> Scan:
+    """Return a scan of re-projections that fit each other, in pixels `factor` times as large."""
+    region = region_of(stream, scan, default_grid(scan.geometry))
+    geometry = scan.geometry.with_motion(motion).binned(factor)
+    stage = "held-out views, simulated"
+    volume = fitted_fbp(
+        stream,
+        Radiographs(stream, scan, factor),
+        geometry,
+        region.grid.binned(factor) if factor > 1 else region.grid,
+        positive=True,
+        terms=1,
+        used=used_pixels(scan, factor),
+        valid_views=np.ones(scan.views, np.bool_),
+        circle=not region.truncated,
+        stage=stage,
+    )
+    return Scan(reprojections(stream, volume, geometry, factor, stage), geometry)
+
+
+def _apparent(stream: Stream, still: Scan, scale: bool) -> Floats:
     """Root mean square of the shifts in u and v that held-out views ask for, gauge-free [pixel]."""
-    views = np.flatnonzero(np.isfinite(predicted.residual))
-    u, v, m = predicted.shift[views].T
-    points = sample_points(default_grid(scan.geometry), _POINTS)
-    gauge = Gauge(scan.geometry.subset(views), points, magnification=scale)
+    held_out = HeldOut(stream, still, default_grid(still.geometry))
+    radiographs, views = held_out.radiographs(np.ones(still.views, np.bool_))
+    predicted = held_out.predict(
+        radiographs,
+        views,
+        Motion.identity(still.views),
+        magnification=scale,
+        whole=True,
+        stage="held-out views, simulated",
+    )
+    held = np.flatnonzero(np.isfinite(predicted.residual))
+    u, v, m = predicted.shift[held].T
+    points = sample_points(default_grid(still.geometry), _POINTS)
+    gauge = Gauge(still.geometry.subset(held), points, magnification=scale)
     left = gauge.fit(Motion(shift_u=u, shift_v=v, magnification=np.exp(m))).remainder
     return np.asarray(np.sqrt(np.mean(left[:, :2] ** 2, axis=0)))
 

@@ -33,7 +33,7 @@ def held(
     motion : RigidMotion
         As found.
     sigma : ndarray, (views, 6)
-        Its standard errors [mm, rad].
+        Its standard errors without any prior [mm, rad].
     valid_views : ndarray of bool, (views,)
         Views to go by.
     free : tuple of int

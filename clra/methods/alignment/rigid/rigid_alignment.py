@@ -117,8 +117,10 @@ class RigidAlignment:
                 self._align_level(factor, iterations, index, begun if index == first else 0)
         table = self.done.motion.table + self._clipped(self.done.slow.left(), 1)
         self.done.motion = self._anchored(self.done.motion.with_table(table))
+        assert self.done.last is not None
+        alone = self._of_slow_modes_too(self.done.last.alone)
         free = FREE[self.estimate]
-        self.done.motion = held(self.done.motion, self._errors(), ~self.done.rejected, free)
+        self.done.motion = held(self.done.motion, alone, ~self.done.rejected, free)
         return self.result()
 
     def _align_level(self, factor: int, iterations: int, index: int, begun: int) -> None:
@@ -185,7 +187,7 @@ class RigidAlignment:
             return self.start
         valid = ~done.rejected
         near, per_u, per_v = done.motion.optics[:, :3].T
-        sigma = self._errors()
+        sigma = self._of_slow_modes_too(done.last.sigma)
         for column, factor in enumerate((per_u / near, per_v / near, 1 / near)):
             sigma[:, column] *= factor
         return AlignmentResult(
@@ -199,7 +201,6 @@ class RigidAlignment:
             device=self.start.device,
         )
 
-    def _errors(self) -> Floats:
-        """Return standard errors in millimetres and radians, of slow modes included."""
-        assert self.done.last is not None
-        return np.asarray(self.done.last.sigma * self.done.slow.growth(self.scan.views))
+    def _of_slow_modes_too(self, sigma: Floats) -> Floats:
+        """Return standard errors that count what adds up in slow modes."""
+        return np.asarray(sigma * self.done.slow.growth(self.scan.views))

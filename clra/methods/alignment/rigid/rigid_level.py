@@ -135,14 +135,14 @@ class RigidLevel:
         )
         project = SlabMoments(stream, volume, geometry)
         table = rigid_table(geometry)
-        totals = np.empty((views, PRODUCTS))
+        totals = np.empty((views, register.blocks, PRODUCTS))
         for chunk in chunks:
             stream.report(f"{title}: registering", chunk.start, views)
             count = chunk.stop - chunk.start
             measured = stream.upload(radiographs.read(chunk))
             simulated, over_depth = (stream.empty((count, rows, columns)) for _ in range(2))
             project.moments(simulated, over_depth, chunk)
-            out = stream.empty((count, PRODUCTS))
+            out = stream.empty((count, register.blocks, PRODUCTS))
             numbers = stream.upload(table[chunk])
             register(stream.queue, out, measured, simulated, over_depth, numbers)
             totals[chunk] = stream.download(out)

@@ -15,6 +15,10 @@ _RIDGE = 1e-12  # of the diagonal: parameters that a view does not show stay 0
 # have most of their power where the low-pass leaves less of the noise, between 1/2 for white ones
 # and 1/sqrt(2) for those of edges. Estimates from noisy re-projections of balls scatter so.
 _IN_BAND = 0.6
+# Bands of rows below which their scatter says nothing; and the part of its variance that stays once
+# the bias is taken off. Balls of equal contrast scatter 3 times as much as white noise would, a
+# rock 40 times in v, a dense ball with faint ones inside 200 times in the rotation about u.
+_FEW, _STAYS = 4, 0.06
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,8 @@ class RigidStep:
         Translations [mm] and rotations [rad], as in `clra.model.rigid.rigid_motion.PARAMETERS`.
     sigma : ndarray, (views, 6)
         Standard errors of the noise, the prior included; NaN where not estimated.
+    alone : ndarray, (views, 6)
+        The same without the prior.
     correlation : ndarray, (views,)
         Of the measured and the simulated radiograph, before the step.
     residual : ndarray, (views,)
@@ -35,6 +41,7 @@ class RigidStep:
 
     table: Floats
     sigma: Floats
+    alone: Floats
     correlation: Floats
     residual: Floats
 
@@ -50,7 +57,7 @@ def solve(
 
     Parameters
     ----------
-    totals : ndarray, (views, 36)
+    totals : ndarray, (views, blocks, 36)
         As `clra.ops.registration.rigid_registration.RigidRegistration` gives them.
     free : tuple of int
         Parameters to estimate; a gain is always fitted.
@@ -62,10 +69,11 @@ def solve(
         Sigma of the band-pass that the images are behind [pixel].
     """
     correlated = max(1.0, _IN_BAND * 4 * np.pi * low_pass**2)  # pixels that count as one sample
-    views, count = len(totals), len(free)
-    gram = np.empty((views, IMAGES, IMAGES))
+    views, blocks, count = *totals.shape[:2], len(free)
+    bands = np.empty((views, blocks, IMAGES, IMAGES))
     upper = np.triu_indices(IMAGES)
-    gram[:, upper[0], upper[1]] = gram[:, upper[1], upper[0]] = totals
+    bands[..., upper[0], upper[1]] = bands[..., upper[1], upper[0]] = totals
+    gram = bands.sum(axis=1)
     unknown = [*free, _GAIN]
     # Of one length each, or millimetres and radians differ by orders of magnitude.
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", gram)[:, unknown], 1e-300))
@@ -78,20 +86,37 @@ def solve(
         left = square - 2 * np.sum(x * right, axis=1) + np.einsum("ni,nij,nj->n", x, normal, x)
         return np.asarray(np.maximum(left, 1e-12 * square) / weight)
 
-    plain = np.linalg.solve(normal + ridge, right[:, :, None])[:, :, 0]
+    whole = np.linalg.inv(normal + ridge)
+    plain = np.einsum("nij,nj->ni", whole, right)
     noise = correlated * variance(plain)
+    grown = np.ones(count + 1)
+    if blocks >= _FEW:
+        rows = bands[:, :, unknown] / scale[:, None, :, None]
+        asked = rows[..., _DIFFERENCE] - np.einsum(
+            "nbij,nj->nbi", rows[..., unknown], plain / scale
+        )
+        by_noise = np.maximum(noise[:, None] * np.einsum("nii->ni", whole), 1e-300)
+        grown = np.maximum(1.0, _STAYS * np.median(_scatter(asked, whole) / by_noise, axis=0))
     known = np.zeros((views, count + 1))
-    some = prior[list(free)] > 0
-    known[:, :count][:, some] = noise[:, None] / prior[list(free)][some] ** 2
+    some = np.append(prior[list(free)] > 0, False)
+    known[:, some] = noise[:, None] * grown[some] / prior[list(free)][some[:-1]] ** 2
     held = normal + ridge + np.einsum("ni,ij->nij", known / scale**2, np.eye(count + 1))
     inverse = np.linalg.inv(held)
     x = np.einsum("nij,nj->ni", inverse, right)
-    table, sigma = np.zeros((views, 6)), np.full((views, 6), np.nan)
+    table, sigma, alone = np.zeros((views, 6)), *np.full((2, views, 6), np.nan)
     table[:, list(free)] = (x / scale)[:, :count]
-    spread = np.sqrt(noise[:, None] * np.einsum("nii->ni", inverse)) / scale
-    sigma[:, list(free)] = spread[:, :count]
+    for errors, covariance in ((sigma, inverse), (alone, whole)):
+        spread = np.sqrt(noise[:, None] * grown * np.einsum("nii->ni", covariance)) / scale
+        errors[:, list(free)] = spread[:, :count]
     own = gram[:, _GAIN, _GAIN]
     crossed = own + gram[:, _GAIN, _DIFFERENCE]
     measured = own + 2 * gram[:, _GAIN, _DIFFERENCE] + square
     correlation = crossed / np.sqrt(np.maximum(own * measured, 1e-300))
-    return RigidStep(table, sigma, correlation, np.sqrt(variance(x)))
+    return RigidStep(table, sigma, alone, correlation, np.sqrt(variance(x)))
+
+
+def _scatter(asked: Floats, inverse: Floats) -> Floats:
+    """Return variances of a solution by how bands of rows differ in what they still ask for."""
+    bands = asked.shape[1]
+    steps = np.einsum("nij,nbj->nbi", inverse, asked)
+    return np.asarray(np.sum(steps**2, axis=1) * bands / (bands - 1))

@@ -23,7 +23,7 @@ from clra.model.rigid.rigid_motion import RigidMotion
 Floats = NDArray[np.float64]
 
 _NAME = "rigid"
-_STEP = ("table", "sigma", "correlation", "residual")
+_STEP = ("table", "sigma", "alone", "correlation", "residual")
 
 
 @dataclass

@@ -94,7 +94,7 @@ def test_normal_equations_are_solved_view_by_view():
     true = random.normal(size=(3, 7))
     images[:, 7] = np.einsum("nk,nkp->np", true, images[:, :7]) + 0.01 * images[:, 7]
     gram = np.einsum("nip,njp->nij", images, images)
-    totals = np.stack([one[np.triu_indices(8)] for one in gram])
+    totals = np.stack([one[np.triu_indices(8)] for one in gram])[:, None]
     found = solve(totals, (0, 1, 2, 3, 4, 5), np.zeros(6), 400.0, 0.0)
     assert np.abs(found.table - true[:, :6]).max() < 0.004
     assert np.allclose(found.sigma, 0.01 / 20, rtol=0.3)
