@@ -34,10 +34,13 @@ Floats = NDArray[np.float64]
 
 # Angle that the detector spans from the source below which a beam counts as parallel [rad].
 _PARALLEL = math.radians(0.1)
-# Root mean square of the shifts, in heights or widths of the detector, from which on the motion is
-# large. Circles align by themselves up to twice that, helices do not. And the part of the rows'
-# sums' squared mismatch that may be left.
-_LARGE, _UNEXPLAINED = 0.08, 0.25
+# Robust standard deviation of the shifts, in heights or widths of the detector, from which on the
+# motion is large. Circles align by themselves up to twice that, helices do not.
+_LARGE = 0.08
+# Part of the rows' sums' squared mismatch that may be left: of a parallel beam, and of a cone.
+# Large motions of a cone that were found left up to 0.08, profiles of helices that fitted each
+# other where they should not 0.11 and more.
+_UNEXPLAINED, _UNEXPLAINED_OF_CONE = 0.25, 0.1
 # Root mean square of an error, by halves of the sample, up to which slow modes or each view's shift
 # count as known [pixel]; and what is lost of the mass, times the sample's half width [pixel].
 _KNOWN, _LOST = 0.03, 0.1
@@ -188,7 +191,8 @@ def prealigned(
         return None
     along_u, along_v = found
     unexplained = along_v.after**2 / max(along_v.before**2, np.finfo(float).tiny)
-    if unexplained > _UNEXPLAINED:
+    parallel = tells_slow_modes(geometry)
+    if unexplained > (_UNEXPLAINED if parallel else _UNEXPLAINED_OF_CONE):
         return None
     views, good = np.arange(geometry.views), np.flatnonzero(valid_views)
     shift_u, shift_v = (
@@ -197,18 +201,22 @@ def prealigned(
     )
     motion = Motion(shift_u=shift_u, shift_v=shift_v)
     known, exact = np.zeros((3, geometry.views), np.bool_), np.zeros(2, np.bool_)
-    if tells_slow_modes(geometry):
+    if parallel:
         told, exact = _accuracy(along_u, along_v, sums, radiographs.level)
         known[:, good] = told[[0, 1, 1], None] & sums.whole
         stretch = np.interp(views, good, along_v.stretch)
         motion = replace(motion, magnification=1 + stretch)
     rest = gauge.anchored(motion)
     sides = zip((rest.shift_u, rest.shift_v), reversed(geometry.shape), strict=True)
-    moved = max(float(np.std(shift)) / size for shift, size in sides)
+    moved = max(_robust_deviation(shift) / size for shift, size in sides)
     if moved < _LARGE and not known.any():
         return None
     residual = along_v.after / (2 * sums.half_width + 1)
     return Prealignment(motion, known, exact, 1 - unexplained, residual)
+
+
+def _robust_deviation(values: Floats) -> float:
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def tells_slow_modes(geometry: ConeBeamGeometry) -> bool:
