@@ -120,6 +120,7 @@ def measured(method: str, scan: Path, folder: Path, host: int | None, device: in
 def predicted(method: str, path: Path, host: int, device: int) -> Any:
     """Ask what clra info would say."""
     import clra
+    from clra.methods.alignment.reprojection import with_margin
     from clra.methods.memory_estimate import alignment_need, multigrid_need, reconstruction_need
     from clra.model.grid import default_grid
     from clra.ops.runtime.devices import choose_device
@@ -129,7 +130,8 @@ def predicted(method: str, path: Path, host: int, device: int) -> Any:
     grid = default_grid(geometry)
     budgets = Budgets.of(choose_device(), device, host)
     if method == "align":
-        quarter, half = (alignment_need(budgets, geometry, grid, level) for level in (4, 2))
+        wide = with_margin(grid)
+        quarter, half = (alignment_need(budgets, geometry, wide, level) for level in (4, 2))
         return quarter.beside(half)
     if method == "imgr":
         return multigrid_need(budgets, geometry, grid)

@@ -56,7 +56,9 @@ class Cost:
     multigrid: "Need | None" = None
 
 
-def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
+def costs_of(
+    geometry: ConeBeamGeometry, speed: Speed, aligned: VolumeGrid | None = None
+) -> list[Cost]:
     """Estimate the cost of each level, from full to quarter resolution.
 
     Parameters
@@ -65,6 +67,9 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
         Of the scan.
     speed : Speed
         Of the device, from :func:`measure`.
+    aligned : VolumeGrid, optional
+        Where alignment reconstructs at full resolution, as far as radiographs tell; by default the
+        field of view with a margin.
     """
     whole = default_grid(geometry)
     seen = views_a_voxel(geometry, whole)
@@ -90,23 +95,28 @@ def costs_of(geometry: ConeBeamGeometry, speed: Speed) -> list[Cost]:
                 iteration_s=reconstruction + projection + pixels * speed.registering,
                 exact_s=exact_updates(geometry, whole) / level**3 * speed.exact_back
                 + pixels * speed.exact_filtering,
-                **_needs(speed, geometry, whole, level),
+                **_needs(speed, geometry, whole, aligned, level),
             )
         )
     return costs
 
 
 def _needs(
-    speed: Speed, geometry: ConeBeamGeometry, grid: VolumeGrid, level: int
+    speed: Speed,
+    geometry: ConeBeamGeometry,
+    grid: VolumeGrid,
+    aligned: VolumeGrid | None,
+    level: int,
 ) -> dict[str, "Need"]:
     if speed.budgets is None:
         return {}
+    from clra.methods.alignment.reprojection import with_margin
     from clra.methods.memory_estimate import alignment_need, multigrid_need, reconstruction_need
 
     binned = (geometry.binned(level), grid.binned(level)) if level > 1 else (geometry, grid)
     needs = {
         "reconstruction": reconstruction_need(speed.budgets, *binned),
-        "iteration": alignment_need(speed.budgets, geometry, grid, level),
+        "iteration": alignment_need(speed.budgets, geometry, aligned or with_margin(grid), level),
     }
     if not math.isnan(speed.exact_back):
         needs["exact"] = reconstruction_need(speed.budgets, *binned, lines=2)

@@ -106,12 +106,13 @@ def alignment_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid, l
     full : ConeBeamGeometry
         Of the scan.
     grid : VolumeGrid
-        Of the volume at full resolution.
+        Of :func:`clra.methods.alignment.region.region_of`, at full resolution: that of a truncated
+        or long sample is wider or higher than the field of view.
     level : int
         Binning: 1, 2 or 4.
     """
     geometry = full.binned(level) if level > 1 else full
-    grid = with_margin(grid).binned(level) if level > 1 else with_margin(grid)
+    grid = grid.binned(level) if level > 1 else grid
     # What the radiographs have beyond the re-projections is kept beside them; on small detectors
     # the re-projections are as well.
     solver = Solver()
@@ -125,8 +126,10 @@ def multigrid_need(budgets: Budgets, full: ConeBeamGeometry, grid: VolumeGrid) -
 
     Parameters
     ----------
-    budgets, full, grid
+    budgets, full
         As :func:`alignment_need` takes them.
+    grid : VolumeGrid
+        Of the volume at full resolution.
     """
     # Radiographs of the lower levels, and the simulated ones.
     kept = [_bytes(full.binned(level)) for level in (4, 2)] + [_bytes(full)]

@@ -45,7 +45,10 @@ def info(
     from clra.app.scan_description import Facts, scanner_text, table
     from clra.app.speed import Speed, measure
     from clra.errors import DeviceError
+    from clra.methods.alignment.region import region_of
     from clra.methods.preparation import prepared
+    from clra.model.grid import default_grid
+    from clra.ops.streaming.stream import Stream
 
     limits = memory.limits()
     scanner = reading.scanner(scan)
@@ -63,7 +66,12 @@ def info(
             raise
         warn("no-times", f"no times: {error}")
         speed = Speed.unknown()
-    costs = costs_of(opened.geometry, speed)
+    aligned = None
+    if speed.budgets is not None and not unread:
+        part = opened.cropped()
+        stream = Stream(console.device, **limits)
+        aligned = region_of(stream, part, default_grid(part.geometry)).grid
+    costs = costs_of(opened.geometry, speed, aligned)
     told = "" if scanner is None else f"\n\n{scanner_text(scanner)}"
     text = f"{table(facts.lines())}{told}\n\n{costs_table(costs, speed)}"
     values = {"scan": facts, "device": speed.device, "levels": costs}

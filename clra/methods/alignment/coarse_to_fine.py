@@ -33,7 +33,8 @@ from clra.methods.alignment.result import (
     finished,
 )
 from clra.methods.alignment.steps.acceleration import MotionSteps
-from clra.methods.alignment.steps.slow_modes import SlowSteps, held
+from clra.methods.alignment.steps.magnifications import Magnifications
+from clra.methods.alignment.steps.slow_modes import SlowSteps
 from clra.methods.execution.checkpoint import Checkpoint, Saved
 from clra.methods.execution.packing import (
     State,
@@ -121,6 +122,8 @@ class CoarseToFine:
         # Taken out of the shifts alone: to fit them a little better, the joint fit would take
         # magnifications of several per cent.
         self.shift_gauge = Gauge(self.scan.geometry, points, magnification=False)
+        place = (self.scan.geometry, self.region.sample) if self.anchor else None
+        self.magnifications = Magnifications(self.solver, self.start, self.scale, place)
 
     def align(self, stages: Sequence[Stage], saved: Saved | None = None) -> None:
         """Go through the levels, or what is left of them; what an interruption leaves is kept."""
@@ -176,8 +179,10 @@ class CoarseToFine:
         steps = self.solver.acceleration()
         self.steps = MotionSteps(steps, self.scan.geometry.shape, self.scale)
         slow, previous = SlowSteps(), None
+        self.magnifications.begin(level.radiographs.shape[1:])
         for iteration in range(done + 1, (stage.iterations or stage.limit) + 1):
             started = time.perf_counter()
+            self.magnifications.prepare(self.motion, ~self.rejected, first=self.registered is None)
             of = f"{name} {iteration}/{stage.iterations or f'at most {stage.limit}'}"
             found = self._iterate(level, title=of)
             wrong = self.rejections.of(found.correlation) & ~self.rejected
@@ -205,6 +210,7 @@ class CoarseToFine:
             update_u, update_v = update[:, ~self.rejected]
             ended = (
                 stage.iterations is None
+                and not self.magnifications.displaced
                 and left < stage.slow
                 and converged(update_u, update_v, previous, stage.tolerance)
             )
@@ -230,6 +236,7 @@ class CoarseToFine:
             magnification=self.scale and not shifts_only,
             measure=not shifts_only,
             title=title,
+            pulled=not self.magnifications.probing,
         )
 
     def _move(self, found: Registered, level: int) -> tuple[Floats, str]:
@@ -239,7 +246,7 @@ class CoarseToFine:
         """
         first, self.registered = self.registered is None, found
         self.rejected = self.rejections.of(found.correlation)
-        there = self._held(self.motion.then(found.motion), found, level)
+        there = self.magnifications.held(self.motion.then(found.motion), found)
         self.found = self.rejections.settled(
             self.motion, there, self.rejected, first=first
         ).normalised()
@@ -255,20 +262,14 @@ class CoarseToFine:
             note = warned(out_of_reach=far_motion(found.motion, level))
             self.fresh = True
         self.last = level, update
+        aside = self.magnifications.aside(self.motion, found, ~self.rejected)
+        if aside is not None:
+            self.origin, there, self.fresh = aside.then(self.origin), aside.then(there), True
+            self.steps.forget()  # points at other depths shift anew
         # A first step's reconstruction was blurred, and what it registered is not all that later
         # ones do: nothing to extrapolate from.
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
         return step, note
-
-    def _held(self, motion: Motion, found: Registered, level: int) -> Motion:
-        """Pull magnifications to those expected, where registration did not."""
-        spread = self.solver.jitter(self.scan.geometry.binned(level).shape)
-        if not (self.scale and spread):
-            return motion
-        expected = np.log(self.start.magnification)
-        logarithm = np.log(motion.magnification) - expected
-        pulled = held(logarithm, found.sigma[:, 2], spread)
-        return replace(motion, magnification=np.exp(pulled + expected))
 
     def _keep(self, stage: int, done: int) -> None:
         """Keep what the iterations so far gave: `done` of a stage."""

@@ -70,6 +70,7 @@ class Level:
         magnification: bool,
         measure: bool,
         title: str,
+        pulled: bool = True,
     ) -> Registered:
         """Reconstruct, simulate and register: what is left of the motion.
 
@@ -89,10 +90,12 @@ class Level:
             Whether to find the bias, if it is not known and images are so small that it counts.
         title : str
             What progress reports begin with.
+        pulled : bool
+            Whether magnifications of small images are pulled to what is expected.
         """
         # Motions are in full-resolution pixels: absorb first, then bin.
         geometry = self.scan.geometry.with_motion(motion).binned(self.factor)
-        at = At(geometry, known, valid_views, first, magnification)
+        at = At(geometry, known, valid_views, first, magnification, pulled)
         # 2: reconstruct from the corrected radiographs
         volume = self._reconstructed(at, self.radiographs, title)
         # 3, 4: simulate and register
@@ -141,6 +144,7 @@ class Level:
                 radiographs,
                 first=at.first,
                 magnification=at.magnification,
+                pulled=at.pulled,
             ),
             magnification=at.known,
             detector=self.scan.geometry.shape,
@@ -178,7 +182,7 @@ class At:
         Magnification that it has absorbed, against the one that is expected.
     valid_views : ndarray of bool, (views,)
         Views to reconstruct from.
-    first, magnification : bool
+    first, magnification, pulled : bool
         As for :meth:`Level.residual_motion`.
     """
 
@@ -187,3 +191,4 @@ class At:
     valid_views: NDArray[np.bool_]
     first: bool
     magnification: bool
+    pulled: bool

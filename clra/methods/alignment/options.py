@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clra.errors import InputError
-from clra.methods.alignment.reprojection import SPREAD, is_large, registration_for
+from clra.methods.alignment.reprojection import SPREAD, is_large, registration_for, spread_of
 from clra.methods.alignment.steps.acceleration import Anderson
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.sampling.angular_coverage import covered
@@ -101,8 +101,9 @@ class Solver:
         *,
         first: bool,
         magnification: bool,
+        pulled: bool = True,
     ) -> Registration | PhaseCorrelation:
-        """Step 4's estimator; arguments as of `registration_for`."""
+        """Step 4's estimator; arguments as of `registration_for`, and whether it pulls at all."""
         if self.estimator == "phase-correlation":
             return PhaseCorrelation(stream.context, radiographs.shape[1:], allocator=stream.memory)
         return registration_for(
@@ -111,7 +112,7 @@ class Solver:
             radiographs,
             first=first,
             magnification=magnification,
-            spread=0.0 if self.jitter(radiographs.shape[1:]) else self.spread,
+            spread=self.spread if pulled and not self.jitter(radiographs.shape[1:]) else 0.0,
         )
 
     def jitter(self, shape: tuple[int, ...]) -> float:
@@ -121,6 +122,10 @@ class Solver:
         leave it for the next level.
         """
         return self.spread if is_large((shape[0], shape[1])) else 0.0
+
+    def pull(self, shape: tuple[int, ...]) -> float:
+        """Spread to which registration of (rows, columns) pulls magnifications; 0 for none."""
+        return 0.0 if self.jitter(shape) else spread_of(self.spread, (shape[0], shape[1]))
 
     def is_biased(self, geometry: ConeBeamGeometry) -> bool:
         """Whether what is found with radiographs of this geometry has to be corrected.

@@ -192,10 +192,23 @@ def outliers(correlation: Floats) -> NDArray[np.bool_]:
     -------
     ndarray of bool, (views,)
     """
-    middle = np.median(correlation)
-    spread = 1.4826 * np.median(np.abs(correlation - middle))
-    least = min(_LEAST, _LACK * (1 - middle))
-    return np.asarray(correlation < middle - max(_DEVIATIONS * spread, least))
+    middle = float(np.median(correlation))
+    spread = 1.4826 * float(np.median(np.abs(correlation - middle)))
+
+    def lowest(usual: float) -> float:
+        return usual - max(_DEVIATIONS * spread, min(_LEAST, _LACK * (1 - usual)))
+
+    low = np.asarray(correlation < lowest(middle))
+    # What views at the ends of a scan look at hardly any other sees: all of them fit it worse, and
+    # the more so the fewer are valid. Wrong ones are worse than those beside them, too.
+    for order in (slice(None), slice(None, None, -1)):
+        ends, values = low[order], correlation[order]
+        sound = np.convolve(~ends, np.ones(_NEIGHBOURS), "valid") == _NEIGHBOURS
+        for view in range(int(sound.argmax()) if sound.any() else 0):
+            start = max(0, view - _NEIGHBOURS // 2)
+            near = float(np.median(values[start : start + _NEIGHBOURS]))
+            ends[view] &= values[view] < lowest(near)
+    return low
 
 
 def neighbour_weights(source: Floats, valid_views: NDArray[np.bool_]) -> Floats:

@@ -130,7 +130,7 @@ def registration_for(
         high_pass=high_pass,
         mask=None if mask is None else binned_mask(mask, radiographs.level),
         magnification=magnification and not still,
-        spread=spread * _size((rows, columns)) ** 2,
+        spread=spread_of(spread, (rows, columns)),
         coarse=not still,
         max_shift=_STILL if still else REACH,
         allocator=stream.memory,
@@ -147,6 +147,11 @@ def band_of(shape: tuple[int, int], *, first: bool = False) -> tuple[float, floa
 def is_large(shape: tuple[int, int]) -> bool:
     """Whether images of (rows, columns) tell magnifications as far as they are expected."""
     return _size(shape) == 1
+
+
+def spread_of(spread: float, shape: tuple[int, int]) -> float:
+    """Spread that magnifications of images of (rows, columns) are held to, see `SPREAD`."""
+    return spread * _size(shape) ** 2
 
 
 def _size(shape: tuple[int, int]) -> float:

@@ -142,6 +142,7 @@ class Register:
     known: NDArray[np.float64]
     first: bool
     magnification: bool
+    pulled: bool
 
     def __call__(self, stream: Stream, views: slice) -> NDArray[np.float64]:
         """Return a row a view, see ``ESTIMATE_FIELDS``."""
@@ -153,6 +154,7 @@ class Register:
             radiographs,
             first=self.first,
             magnification=self.magnification,
+            pulled=self.pulled,
         )
         table = np.empty((geometry.views, len(ESTIMATE_FIELDS)))
         known = self.known[views]

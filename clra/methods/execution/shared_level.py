@@ -113,6 +113,7 @@ class SharedLevel(Level):
             at.known,
             at.first,
             at.magnification,
+            at.pulled,
         )
         tables = self.cluster.map(task, self._chunks, stage=stage)
         return in_full_pixels(np.concatenate(tables), self.factor, self.scan.geometry.shape)

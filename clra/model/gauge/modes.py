@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.motion import Motion
 from clra.model.validation import vectors
 
 Floats = NDArray[np.float64]
@@ -116,3 +117,33 @@ def _apparent(
     dm = (sum_along - mean_a * sum_u - mean_b * sum_v) / np.where(fitted, spread, 1.0)
     du, dv = sum_u / count - dm * mean_a, sum_v / count - dm * mean_b
     return np.where(fitted, np.stack([du, dv, dm]), 0.0)
+
+
+def apparent_shift(
+    geometry: ConeBeamGeometry, points: ArrayLike, offset: tuple[float, float, float]
+) -> Motion:
+    """Return the motion that a sample shows from where it is offset to where its points are.
+
+    Unlike :func:`gauge_columns` for movements of any length.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the scan.
+    points : array_like, (n, 3)
+        Points of the sample, which every view sees [mm].
+    offset : (float, float, float)
+        By which it was displaced along x, y and z [mm].
+
+    Returns
+    -------
+    Motion
+        Least-squares fit, over the points, of shift and magnification in each view.
+    """
+    there = vectors("points", points, "points")
+    centre = np.array([geometry.columns - 1, geometry.rows - 1]) / 2
+    before, after = (geometry.project(p) - centre for p in (there + offset, there))
+    spread = before - before.mean(axis=1, keepdims=True)
+    m = np.sum(spread * after, axis=(1, 2)) / np.sum(spread**2, axis=(1, 2))
+    u, v = (after - m[:, None, None] * before).mean(axis=1).T
+    return Motion(shift_u=u, shift_v=v, magnification=m)

@@ -26,12 +26,15 @@ def _region(geometry, semi_axes, level=0.0):
     return region_of(Stream(), scan, default_grid(geometry)), with_margin(default_grid(geometry))
 
 
-@pytest.mark.parametrize(("radius", "truncated"), [(2.0, False), (3.0, True)])
-def test_a_truncated_sample_gets_a_wider_grid(radius, truncated):
+@pytest.mark.parametrize(
+    ("radius", "truncated", "width"), [(2.0, False, 1.0), (3.0, True, 1.25), (5.0, True, 1.6)]
+)
+def test_a_truncated_sample_gets_a_grid_as_wide_as_it_seems(radius, truncated, width):
     region, usual = _region(clra.circular(40, **DETECTOR), (radius, radius, 1.0))
     assert region.truncated == truncated
     assert region.sample == usual
-    assert (region.grid.shape[1] >= 1.5 * usual.shape[1]) == truncated
+    # Of radius 3 it reaches 0.07 of the detector beyond each side: 1.15 + 18 * 0.07^2.
+    assert region.grid.shape[1] == pytest.approx(width * usual.shape[1], rel=0.1)
     assert region.terms(1) == (3 if truncated else 1) and region.terms(0) == 0
 
 

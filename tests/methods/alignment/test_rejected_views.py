@@ -32,6 +32,19 @@ def test_where_all_fit_perfectly_little_is_already_far():
     assert np.flatnonzero(outliers(correlation)).tolist() == [7]
 
 
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_the_last_views_of_a_scan_may_all_fit_worse(order):
+    correlation = np.full(180, 0.999)
+    correlation[150:] = np.linspace(0.999, 0.8, 30)
+    assert not outliers(correlation[order]).any()
+    # A wrong one among them, or at the very end of a scan whose others fit, is found.
+    correlation[165] = 0.4
+    assert np.flatnonzero(outliers(correlation[order])[order]).tolist() == [165]
+    correlation[150:] = 0.999
+    correlation[178] = 0.9
+    assert np.flatnonzero(outliers(correlation[order])[order]).tolist() == [178]
+
+
 def _odd(images):
     geometry = clra.circular(
         len(images),

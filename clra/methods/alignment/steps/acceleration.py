@@ -10,8 +10,9 @@ Floats = NDArray[np.float64]
 # Tikhonov weight relative to the squared length of each difference: at a tenth of it random motions
 # make the extrapolation noisy, at ten times it slow modes stay slow.
 _DAMPING = 1e-3
-# An extrapolated step longer than this many plain ones is rejected.
-_LONGEST = 3.0
+# An extrapolated step longer than this many plain ones is rejected, where a plain one counts as at
+# least so long, in the units of x.
+_LONGEST, _SHORT = 3.0, 0.5
 
 
 class Anderson:
@@ -25,8 +26,6 @@ class Anderson:
     ----------
     memory : int
         Differences kept; 0 leaves the iteration plain.
-    floor : float
-        Steps below this length are always accepted, in the units of x.
 
     References
     ----------
@@ -34,9 +33,12 @@ class Anderson:
        Anal. 49, 1715 (2011).
     """
 
-    def __init__(self, memory: int = 3, *, floor: float = 0.5) -> None:
+    def __init__(self, memory: int = 3) -> None:
         self.memory = memory
-        self.floor = floor
+        self.forget()
+
+    def forget(self) -> None:
+        """Go on as if from the first step."""
         self._last: tuple[Floats, Floats] | None = None
         self._differences: list[tuple[Floats, Floats]] = []
 
@@ -64,7 +66,7 @@ class Anderson:
         dx, df = dx / length, df / length
         normal = df.T @ df + _DAMPING * np.eye(df.shape[1])
         step = f - ((dx + df) @ np.linalg.solve(normal, df.T @ f.ravel())).reshape(f.shape)
-        if np.abs(step).max() > _LONGEST * max(float(np.abs(f).max()), self.floor):
+        if np.abs(step).max() > _LONGEST * max(float(np.abs(f).max()), _SHORT):
             return x + f
         return np.asarray(x + step)
 
@@ -91,6 +93,10 @@ class MotionSteps:
     def step(self, here: Motion, there: Motion) -> Floats:
         """Return the plain step in u, v and, if estimated, scale, (2 or 3, views) [pixel]."""
         return self._as_lengths(there) - self._as_lengths(here)
+
+    def forget(self) -> None:
+        """Extrapolate from no step so far."""
+        self._anderson.forget()
 
     def next(self, here: Motion, there: Motion, *, plain: bool) -> Motion:
         """Return the next motion.
