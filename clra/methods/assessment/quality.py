@@ -146,7 +146,8 @@ def judged(quality: Quality, views: int) -> Quality:
             )
         )
     # Of few views each is seen from where no other one is.
-    if unexplained > _UNEXPLAINED and (views >= _FEW or error > _DOUBTFUL):
+    few = views < _FEW
+    if unexplained > _UNEXPLAINED and (not few or error > _DOUBTFUL):
         grade = max(grade, 2 if unexplained > _HOPELESS else 1)
         reasons.append(
             Finding(
@@ -158,7 +159,7 @@ def judged(quality: Quality, views: int) -> Quality:
                 measured={"residual": unexplained, "before": quality.residual_before},
             )
         )
-    if quality.slow_magnification > _MAGNIFIED and quality.distortion > _DOUBTFUL:
+    if quality.slow_magnification > _MAGNIFIED and quality.distortion > _DOUBTFUL and not few:
         grade = max(grade, 1)
         reasons.append(
             Finding(

@@ -90,6 +90,8 @@ def test_a_slow_error_of_the_magnification_is_doubtful():
     for slow, distortion in ((0.005, 0.5), (0.02, 0.2)):
         few = Quality("good", slow_magnification=slow, distortion=distortion)
         assert judged(few, 100).verdict == "good"
+    # Nine views hardly tell.
+    assert judged(Quality("good", slow_magnification=0.02, distortion=0.5), 9).verdict == "good"
 
 
 def test_plain_values_and_back(scan, truth):
