@@ -181,15 +181,17 @@ def large_motion(motion: Motion, geometry: ConeBeamGeometry) -> Finding | None:
     )
 
 
-def doubted_rotation(sharpening: float) -> Finding | None:
+def doubted_rotation(sharpening: float, least: float = _SHARPER) -> Finding | None:
     """Return a finding if slices are sharper with the sample turning the other way.
 
     Parameters
     ----------
     sharpening : float
         Mean squared gradient of slices that way, relative to the sense taken.
+    least : float
+        From which on it is told.
     """
-    if not sharpening > _SHARPER:
+    if not sharpening > least:
         return None
     return Finding(
         "rotation-sense",
