@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -14,8 +15,8 @@ from clra.errors import InputError
 from clra.io.volumes.slab_files import SlabWriter
 from clra.io.volumes.volume_description import PlaneSink, VolumeDescription
 
-# Voxels that percentiles are taken of, and bytes that are converted at a time.
-_SAMPLE, _PIECE = 1 << 22, 8 << 20
+# Voxels that percentiles are taken of, at most, and bytes that are converted at a time.
+_SAMPLE, _PIECE = 1 << 20, 2 << 20
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,12 @@ def integer_writer(
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".clra-values-") as kept:
         with SlabWriter(Path(kept.name), 0, shape, np.float32) as values:
             yield values
-        voxels = np.memmap(kept.name, np.float32, "r", 0, shape)
+        voxels = _Values(kept.name, shape)
         whole = description.between(*_percentiles(voxels, limits))
         step = max(1, _PIECE // (4 * shape[1] * shape[2]))
         with open_file(whole) as sink:
             for start in range(0, shape[0], step):
-                sink.write(start, whole.encoded(voxels[start : start + step]))
-        del voxels
+                sink.write(start, whole.encoded(voxels.read(start, min(start + step, shape[0]))))
 
 
 class _Encoded:
@@ -99,11 +99,28 @@ class _Encoded:
         self._sink.write(start, self._description.encoded(part))
 
 
-def _percentiles(voxels: np.ndarray, limits: Limits) -> tuple[float, float]:
+@dataclass(frozen=True)
+class _Values:
+    """Planes in a file; those of a memory map would count as memory of the process."""
+
+    path: str
+    shape: tuple[int, int, int]
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        _, rows, columns = self.shape
+        plane = rows * columns
+        values = np.fromfile(
+            self.path, np.float32, (stop - start) * plane, offset=4 * start * plane
+        )
+        return values.reshape(-1, rows, columns)
+
+
+def _percentiles(voxels: _Values, limits: Limits) -> tuple[float, float]:
     """Values at the limits, of a sample of the voxels."""
-    planes = len(voxels)
-    step = max(1, round((voxels.size / _SAMPLE) ** (1 / 3)))
-    sample = np.concatenate([voxels[k, ::step, ::step].ravel() for k in range(0, planes, step)])
+    planes = voxels.shape[0]
+    step = math.ceil((math.prod(voxels.shape) / _SAMPLE) ** (1 / 3))
+    parts = [voxels.read(k, k + 1)[0, ::step, ::step].ravel() for k in range(0, planes, step)]
+    sample = np.concatenate(parts)
     sample = sample[sample != 0]
     if not sample.size:
         return 0.0, 1.0
