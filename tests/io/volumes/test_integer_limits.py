@@ -23,4 +23,5 @@ def test_percentiles_hold_parts_of_a_volume_only(tmp_path):
     finally:
         tracemalloc.stop()
     assert peak < WITHIN
-    np.testing.assert_allclose(read_volume(tmp_path / "v.raw", 40, 41)[0], plane, atol=1e-3)
+    # The limits are those of each second row, and values beyond are clipped.
+    np.testing.assert_allclose(read_volume(tmp_path / "v.raw", 40, 41)[0], plane, atol=0.01)
