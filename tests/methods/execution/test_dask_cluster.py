@@ -170,8 +170,12 @@ def test_what_a_cluster_does_not_do(client, scans, call, expected):
         call(scans["helix"], client)
 
 
-def fails(stream, item):
-    raise OSError(28, "No space left on device")
+# Tasks are functions inside others: these travel whole, while workers cannot import a test's module.
+def fails():
+    def task(stream, item):
+        raise OSError(28, "No space left on device")
+
+    return task
 
 
 def fails_at_first(path):
@@ -184,8 +188,11 @@ def fails_at_first(path):
     return task
 
 
-def warns(stream, item):
-    clra.Finding("test", "told by a task").warn()
+def warns():
+    def task(stream, item):
+        clra.Finding("test", "told by a task").warn()
+
+    return task
 
 
 @pytest.fixture
@@ -198,7 +205,7 @@ def cluster(client, tmp_path):
 def test_a_task_that_fails_three_times(cluster):
     expected = r"writing: task 1 on worker .* failed 3 times: .*No space left"
     with pytest.raises(ClusterError, match=expected):
-        cluster.map(fails, [0], stage="writing")
+        cluster.map(fails(), [0], stage="writing")
 
 
 def test_a_task_that_fails_once_is_done_again(cluster, tmp_path):
@@ -207,7 +214,7 @@ def test_a_task_that_fails_once_is_done_again(cluster, tmp_path):
 
 def test_findings_of_tasks_are_told(cluster):
     with pytest.warns(clra.ClraWarning, match="told by a task"):
-        cluster.map(warns, [0], stage="warning")
+        cluster.map(warns(), [0], stage="warning")
 
 
 def test_results_keep_the_order_of_the_items(cluster):
