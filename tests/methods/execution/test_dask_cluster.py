@@ -170,7 +170,7 @@ def test_what_a_cluster_does_not_do(client, scans, call, expected):
         call(scans["helix"], client)
 
 
-# Tasks are functions inside others: these travel whole, while workers cannot import a test's module.
+# Tasks are functions inside others: these travel whole, workers cannot import a test's module.
 def fails():
     def task(stream, item):
         raise OSError(28, "No space left on device")
