@@ -50,7 +50,7 @@ def test_reconstruction_takes_what_is_predicted(budget):
     ],
 )
 def test_alignment_takes_what_is_predicted(detector, level, budget, monkeypatch):
-    scan = _scan(150 if level == 2 else 40, detector)
+    scan = _scan(150 if level == 2 else 12, detector)
     streams = []
 
     def remembered(*arguments, **options):
