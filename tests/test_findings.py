@@ -29,6 +29,7 @@ def dark(views: int = 24) -> clra.Scan:
     return clra.Scan(pixels, geometry, "transmission")
 
 
+@pytest.mark.slow
 def test_warnings_point_at_the_line_that_called() -> None:
     scan = dark()
     with pytest.warns(ClraWarning) as told:
@@ -39,6 +40,7 @@ def test_warnings_point_at_the_line_that_called() -> None:
     assert lines == {line_of("align"), line_of("reconstruct")}
 
 
+@pytest.mark.slow
 def test_a_result_carries_what_was_warned_of() -> None:
     with pytest.warns(ClraWarning) as told:
         result = clra.align(dark(), schedule="1FR")

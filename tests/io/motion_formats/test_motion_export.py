@@ -113,6 +113,7 @@ def test_astra_itself_projects_a_spot_there(tmp_path: Path) -> None:
     assert centre == pytest.approx(expected, abs=0.2)
 
 
+@pytest.mark.slow
 def test_rtk_itself_projects_the_points_there(tmp_path: Path) -> None:
     itk = pytest.importorskip("itk")
     geometry, motion = helix(VIEWS, angle_step=0.5, z_step=0.1, **DETECTOR), _motion()

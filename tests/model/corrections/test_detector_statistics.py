@@ -54,6 +54,7 @@ def spoilt(images, seed, columns=3, side_by_side=False, rows=0):
     [("circular", "none", 9), ("circular", "none", 40), ("helix", "random", 40),
      ("space-filling", "both", 21)],
 )  # fmt: skip
+@pytest.mark.slow
 def test_good_detectors_raise_no_alarm(trajectory, motion, views, phantom, photons):
     images = radiographs(trajectory, phantom, motion, views, seed=views + 11)
     if photons:
@@ -87,6 +88,7 @@ def test_walls_that_stand_still_are_no_dead_lines(wall, photons):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("trajectory", "photons"), [("circular", None), ("helix", 500)])
 @pytest.mark.parametrize("side_by_side", [False, True])
+@pytest.mark.slow
 def test_hot_and_dead_pixels_and_columns_are_found(trajectory, photons, side_by_side, seed):
     clean = radiographs(trajectory, views=60, seed=seed + 40)
     images, bad = spoilt(noisy(clean, photons) if photons else clean, seed, 3, side_by_side)

@@ -25,6 +25,7 @@ def test_all_cells_lie_in_the_cylinder(core):
     assert along_z.any() and not along_z.all()
 
 
+@pytest.mark.slow
 def test_cells_are_hollow_and_the_mean_line_integral_is_one(core):
     size = 2 * RADIUS / 160
     grid = VolumeGrid(shape=(round(HEIGHT / size), 160, 160), voxel_size=size)

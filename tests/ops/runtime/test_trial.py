@@ -91,6 +91,7 @@ def forged(device, index, name, paired):
 
 
 @pytest.mark.parametrize("name", ["znver3", "generic"])
+@pytest.mark.slow
 def test_a_cpu_name_that_does_not_fit_the_built_ins_ends_the_trial_and_pairing_cures_it(name):
     usual = pocl.cpu_of_variant(pocl.cpu_flags())
     for info in devices.devices():
