@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -176,6 +177,8 @@ def run(name: str, one: Run, folder: Path) -> tuple[str, str]:
     tests = [str(ROOT / test) for test in one.tests or ("tests",)]
     # Uncaptured, as a checker's complaints in tests that pass would otherwise be lost.
     options = ["-q", "-s", "--no-header", "-p", "no:cacheprovider", *one.more]
+    if len(tests) > 1 and not one.command and find_spec("xdist"):
+        options += ["-n", "2", "--dist", "loadfile"]
     done = subprocess.run(
         [*prefix, sys.executable, "-P", "-m", "pytest", *options, *tests],
         env=environment,
