@@ -1,5 +1,7 @@
 """Geometries that no trajectory gives."""
 
+from pathlib import Path
+
 import numpy as np
 
 from clra.model.geometry import ConeBeamGeometry
@@ -29,4 +31,17 @@ def upside_down(geometry: ConeBeamGeometry) -> ConeBeamGeometry:
         u=geometry.u,
         v=-geometry.v,
         shape=geometry.shape,
+    )
+
+
+def geometry_of_cil(path: Path) -> ConeBeamGeometry:
+    """What the arguments of CIL's create_Cone3D_SOUV describe."""
+    told = np.load(path)
+    columns, rows = told["num_pixels"]
+    return ConeBeamGeometry(
+        source=told["source_position_set"],
+        detector=told["detector_position_set"],
+        u=told["detector_direction_x_set"] * told["pixel_size"][0],
+        v=told["detector_direction_y_set"] * told["pixel_size"][1],
+        shape=(int(rows), int(columns)),
     )

@@ -6,10 +6,9 @@ derives for an A100), and a shared file system of 2 GB/s is assumed, 1 GB/s for 
 
 import math
 
-from clra.app.cost import size
 from clra.app.planning.cluster_plan import plans
+from clra.app.planning.plan_table import cells
 from clra.app.planning.planned_steps import Workers
-from clra.app.progress_bar import duration
 from clra.app.speed import Speed
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.trajectory import double_helix, space_filling
@@ -52,19 +51,8 @@ def main() -> None:
     for name, geometry in (("wood", wood()), ("stone", stone())):
         for count in WORKERS:
             for plan in plans(geometry, Workers.parse(f"{count}xGPU", Speed.unknown())):
-                cells = (
-                    name,
-                    plan.work,
-                    str(count),
-                    str(plan.tasks),
-                    size(plan.read_bytes),
-                    size(plan.written_bytes),
-                    size(plan.message_bytes),
-                    duration(plan.seconds),
-                    f"{plan.efficiency:.0%}",
-                    plan.limit,
-                )
-                print("| " + " | ".join(cells) + " |")
+                told = (name, plan.work, str(count), *cells(plan))
+                print("| " + " | ".join(told) + " |")
 
 
 if __name__ == "__main__":

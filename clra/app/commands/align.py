@@ -57,7 +57,7 @@ def align(
         typer.Option(
             metavar="TEXT",
             help="Iterations at quarter (QR), half (HR) and full (FR) resolution, such as 2QR-1HR; "
-            "auto: 6ER-3QR on large detectors, else QR until converged; then HR until converged; "
+            "auto: 6ER-3QR on large detectors, else 4ER, and QR until converged; then HR likewise; "
             "before it a pre-alignment (PA) where the motion is large or the beam parallel. "
             "With imgr the levels of a cycle: QR-HR-FR.",
         ),

@@ -76,9 +76,9 @@ def info(
     text = f"{table(facts.lines())}{told}\n\n{costs_table(costs, speed)}"
     values = {"scan": facts, "device": speed.device, "levels": costs}
     if cluster is not None:
-        planned = plans(opened.geometry, Workers.parse(cluster, speed))
-        values["cluster"] = planned
-        text += f"\n\n{plan_table(planned, Workers.parse(cluster, speed))}"
+        workers = Workers.parse(cluster, speed)
+        values["cluster"] = planned = plans(opened.geometry, workers)
+        text += f"\n\n{plan_table(planned, workers)}"
     if scanner is not None:
         values["scanner"] = {
             **scanner.contents(),

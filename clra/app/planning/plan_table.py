@@ -20,19 +20,7 @@ def plan_table(plans: Sequence[Plan], workers: Workers) -> str:
     """
     head = ("cluster", "tasks", "read", "written", "messages", "time", "efficiency", "limited by")
     rows: list[tuple[str, ...]] = [head]
-    for plan in plans:
-        rows.append(
-            (
-                plan.work,
-                str(plan.tasks),
-                size(plan.read_bytes),
-                size(plan.written_bytes),
-                size(plan.message_bytes),
-                duration(plan.seconds),
-                f"{plan.efficiency:.0%}",
-                plan.limit,
-            )
-        )
+    rows += [(plan.work, *cells(plan)) for plan in plans]
     site = Site()
     shared = " and its share of this machine's cores" if workers.cores_shared else ""
     return "\n".join(
@@ -43,4 +31,17 @@ def plan_table(plans: Sequence[Plan], workers: Workers) -> str:
             f"{size(workers.slab_bytes)}{shared}; a shared file system of "
             f"{site.file_system / 1e9:g} GB/s, {site.link / 1e9:g} GB/s a worker, is assumed.",
         ]
+    )
+
+
+def cells(plan: Plan) -> tuple[str, ...]:
+    """Return the numbers of a plan: tasks, bytes, time, efficiency and what limits it."""
+    return (
+        str(plan.tasks),
+        size(plan.read_bytes),
+        size(plan.written_bytes),
+        size(plan.message_bytes),
+        duration(plan.seconds),
+        f"{plan.efficiency:.0%}",
+        plan.limit,
     )

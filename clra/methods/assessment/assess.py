@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,8 @@ from clra.methods.assessment.held_out import FEW, HeldOut, Predicted
 from clra.methods.assessment.quality import Quality, judged
 from clra.methods.assessment.residual_regions import by_part_of_scan
 from clra.methods.assessment.soft_modes import Modes
-from clra.methods.assessment.standard_errors import slow_part, standard_errors
-from clra.model.gauge.gauge import Gauge, sample_points
+from clra.methods.assessment.standard_errors import below_four_cycles, standard_errors
+from clra.model.gauge.gauge import sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered
@@ -77,12 +78,15 @@ def assess(
     before = predicted(start, len(views) < FEW, "before")
     after = predicted(aligned.motion, True, "after")
     points = sample_points(default_grid(scan.geometry), _POINTS)
-    gauge = _Left(scan, points, scale)
-    kept_start = not _better(gauge, before, after)
+
+    def left_of(found: Predicted) -> Floats:
+        return found.left(scan.geometry, magnification=scale)
+
+    kept_start = not _better(before, after, left_of)
     if kept_start and aligned.motion != start:
         aligned = replace(aligned, motion=start)
         after = predicted(start, True, "start")
-    left = gauge.of(after)
+    left = left_of(after)
     tilts = covered(scan.geometry) < np.pi - 1e-6
     sigma = standard_errors(aligned, left, held_out.level, truncated=region.truncated, tilts=tilts)
     # Phase correlation knows no standard errors.
@@ -94,13 +98,13 @@ def assess(
     nudged = predicted(
         aligned.motion, False, "with a known motion", _motion(scan.views, views, put_in)
     )
-    slow = float(np.sqrt(np.mean(slow_part(left[views, 2]) ** 2)))
+    slow = float(np.sqrt(np.mean(below_four_cycles(left[views, 2]) ** 2)))
     quality = Quality(
         verdict="good",
         level=held_out.level,
         residual_before=float(np.nanmedian(before.residual)),
         residual_after=float(np.nanmedian(after.residual)),
-        shift_before=_rms(gauge.of(before)),
+        shift_before=_rms(left_of(before)),
         shift_after=_rms(left),
         error=float(_MEAN * spread.max()),
         slow_magnification=slow,
@@ -121,28 +125,12 @@ def assess(
     return replace(aligned, sigma=sigma, quality=judged(quality, len(views)))
 
 
-class _Left:
-    """Gauge-free part of what predictions find to be left."""
-
-    def __init__(self, scan: Scan, points: Floats, scale: bool) -> None:
-        self._geometry, self._points, self._scale = scan.geometry, points, scale
-
-    def of(self, predicted: Predicted) -> Floats:
-        """Shifts and magnification, (views, 3); NaN for views that were not held out."""
-        held = np.flatnonzero(np.isfinite(predicted.residual))
-        u, v, m = predicted.shift[held].T
-        gauge = Gauge(self._geometry.subset(held), self._points, magnification=self._scale)
-        left = np.full(predicted.shift.shape, np.nan)
-        left[held] = gauge.fit(Motion(shift_u=u, shift_v=v, magnification=np.exp(m))).remainder
-        return left
-
-
-def _better(gauge: _Left, before: Predicted, after: Predicted) -> bool:
+def _better(before: Predicted, after: Predicted, left_of: Callable[[Predicted], Floats]) -> bool:
     """Whether the same held-out views are predicted better after than before."""
     both = np.isfinite(before.residual) & np.isfinite(after.residual)
     gain = before.residual[both] ** 2 - after.residual[both] ** 2
     certain = gain.mean() > 2 * gain.std() / np.sqrt(max(1, both.sum() - 1))
-    apart = [np.sqrt(np.nanmean(gauge.of(p)[both, :2] ** 2)) for p in (before, after)]
+    apart = [np.sqrt(np.nanmean(left_of(p)[both, :2] ** 2)) for p in (before, after)]
     closer = _CLOSER if both.sum() >= FEW // 2 else _CLOSER_OF_FEW
     return bool((certain and gain.mean() > 0) or apart[1] < closer * apart[0])
 

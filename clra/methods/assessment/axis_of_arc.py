@@ -16,7 +16,7 @@ from clra.errors import InputError
 from clra.methods.assessment.sinogram_spectrum import energy_outside
 from clra.model.detector_pose import with_detector
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.sampling.angular_coverage import covered, holes
+from clra.model.sampling.angular_coverage import beside_views, covered, holes
 from clra.model.scan import Scan
 from clra.ops.streaming.stream import Stream
 
@@ -104,13 +104,8 @@ def _measured_twice(geometry: ConeBeamGeometry) -> NDArray[np.bool_]:
     """Whether a view looks back along each ray, (views, columns)."""
     angle, fan = _rays(geometry)
     other = (angle[:, None] + np.pi + 2 * fan) % (2 * np.pi)
-    inside = np.ones(other.shape, np.bool_)
-    step = float(np.median(np.diff(np.sort(angle))))
-    for start, width in holes(geometry):
-        # The view before stands for one that is a step further: of half a turn, that is the pair.
-        beyond = (other - start) % (2 * np.pi)
-        inside &= (beyond <= step) | (beyond >= width - step)
-    return inside
+    # The view before stands for one that is a step further: of half a turn, that is the pair.
+    return beside_views(other, holes(geometry), float(np.median(np.diff(np.sort(angle)))))
 
 
 def _sinogram(stream: Stream, scan: Scan) -> Floats:

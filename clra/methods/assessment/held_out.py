@@ -23,8 +23,9 @@ from clra.methods.alignment.reprojection import (
 )
 from clra.methods.assessment.residual_regions import PARTS, residual_by_part
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
+from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.grid import VolumeGrid
+from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.subsets import ordered_subsets
@@ -48,6 +49,8 @@ _PHOTONS = 1e3
 _SPREAD = 0.1
 # Columns and views of what is looked at, at most: a few seconds whatever the size of the scan.
 _COLUMNS, _VIEWS = 80, 480
+# Points of the sample by which the gauge is known.
+_POINTS = 300
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,24 @@ class Predicted:
     shift: Floats
     parts: Floats
     sharpness: float
+
+    def left(self, geometry: ConeBeamGeometry, *, magnification: bool) -> Floats:
+        """Return the gauge-free part of `shift`, (views, 3); NaN for views not held out.
+
+        Parameters
+        ----------
+        geometry : ConeBeamGeometry
+            Of the scan, at full resolution.
+        magnification : bool
+            Whether it was registered.
+        """
+        held = np.flatnonzero(np.isfinite(self.residual))
+        u, v, m = self.shift[held].T
+        points = sample_points(default_grid(geometry), _POINTS)
+        gauge = Gauge(geometry.subset(held), points, magnification=magnification)
+        left = np.full(self.shift.shape, np.nan)
+        left[held] = gauge.fit(Motion(shift_u=u, shift_v=v, magnification=np.exp(m))).remainder
+        return left
 
 
 @dataclass(frozen=True)

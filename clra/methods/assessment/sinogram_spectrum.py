@@ -15,6 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.model.sampling.angular_coverage import beside_views
+
 Floats = NDArray[np.float64]
 
 # Most columns and angles of the resampled sinogram.
@@ -56,10 +58,7 @@ def energy_outside(lines: Floats, angle: Floats, fan: Floats, missing: Floats) -
 
     def taken(source: Floats, ray: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Interpolated rays of sources and angles in the fan, and whether they were measured."""
-        inside = np.ones(source.shape, np.bool_)
-        for begin, width in missing:
-            beyond = (source - begin) % (2 * math.pi)
-            inside &= (beyond <= step) | (beyond >= width - step)
+        inside = beside_views(source, missing, step)
         at = np.interp(source, angle[order], np.arange(views), period=2 * math.pi)
         column = np.broadcast_to(np.interp(ray, rising, column_of), source.shape)
         left = np.clip(np.floor(column).astype(int), 0, columns - 2)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.assessment.standard_errors import slow_part
+from clra.methods.assessment.standard_errors import below_four_cycles
 from clra.model.gauge.modes import GAUGE_MODES, gauge_columns
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
@@ -158,7 +158,8 @@ class Modes:
             if name in _COSINES:
                 axis = list(_COSINES).index(name)
                 amplitude, shown = (
-                    self._weight[axis] * float(np.sqrt(np.mean(slow_part(table[:, axis]) ** 2)))
+                    self._weight[axis]
+                    * float(np.sqrt(np.mean(below_four_cycles(table[:, axis]) ** 2)))
                     for table in (values, left)
                 )
             else:

@@ -67,14 +67,14 @@ def standard_errors(
     for axis in range(2):
         seen = np.interp(everywhere, known, squares[:, axis])
         sigma[:, axis] = np.sqrt(_REGISTRATION * sigma[:, axis] ** 2 + seen)
-    m = slow_part(left[known, 2])
+    m = below_four_cycles(left[known, 2])
     sigma[:, 2] = np.sqrt(_REGISTRATION_M * sigma[:, 2] ** 2 + np.mean((factors[2] * m) ** 2))
     # Rejected views have their neighbours' motion, and differ from it as neighbours do.
     motion = aligned.motion
     found = np.stack([motion.shift_u, motion.shift_v, motion.magnification], axis=1)
     lost = ~aligned.valid_views
     for axis in range(3):
-        sigma[lost, axis] = np.hypot(sigma[lost, axis], _apart(found[known, axis]))
+        sigma[lost, axis] = np.hypot(sigma[lost, axis], apart_from_neighbours(found[known, axis]))
     return sigma
 
 
@@ -83,7 +83,7 @@ def _last_level(aligned: AlignmentResult, unknown: int) -> int:
     return level_factor(aligned.history[-1].level) if aligned.history else unknown
 
 
-def slow_part(values: Floats) -> Floats:
+def below_four_cycles(values: Floats) -> Floats:
     """Return values along a scan below four cycles of it, without their mean."""
     waves = dct(values, norm="ortho")
     waves[0] = 0.0
@@ -91,8 +91,8 @@ def slow_part(values: Floats) -> Floats:
     return np.asarray(idct(waves, norm="ortho"))
 
 
-def _apart(values: Floats) -> float:
-    """RMS of the difference of values and the mean of their two neighbours."""
+def apart_from_neighbours(values: Floats) -> float:
+    """Return the RMS of the difference of values and the mean of their two neighbours."""
     if len(values) < 3:
         return 0.0
     return float(np.sqrt(np.mean((values[1:-1] - 0.5 * (values[:-2] + values[2:])) ** 2)))

@@ -119,6 +119,29 @@ def holes(geometry: ConeBeamGeometry) -> Floats:
     return np.stack([starts, gaps[here] - step], axis=1)
 
 
+def beside_views(angle: Floats, missing: Floats, step: float) -> NDArray[np.bool_]:
+    """Whether there are views at angles, or one within a step.
+
+    Parameters
+    ----------
+    angle : ndarray
+        Of the source [rad].
+    missing : ndarray, (holes, 2)
+        As of :func:`holes`.
+    step : float
+        Between views [rad].
+
+    Returns
+    -------
+    ndarray of bool, as `angle`
+    """
+    inside = np.ones(angle.shape, np.bool_)
+    for start, width in missing:
+        beyond = (angle - start) % (2 * math.pi)
+        inside &= (beyond <= step) | (beyond >= width - step)
+    return inside
+
+
 def is_whole_circle(geometry: ConeBeamGeometry) -> bool:
     """Whether the sources stand all around a circle."""
     return geometry.views > 1 and is_circle(geometry) and covered(geometry) == 2 * math.pi

@@ -12,7 +12,7 @@ from clra.methods.alignment.result import AlignmentResult
 from clra.methods.assessment.assess import assess
 from clra.methods.assessment.residual_regions import by_part_of_scan, residual_by_part
 from clra.methods.assessment.soft_modes import Modes, SoftMode
-from clra.methods.assessment.standard_errors import slow_part
+from clra.methods.assessment.standard_errors import below_four_cycles
 from clra.model.gauge.gauge import sample_points
 from clra.model.grid import default_grid
 from clra.ops.streaming.stream import Stream
@@ -80,7 +80,7 @@ def test_what_is_not_seen_has_no_uncertainty():
 def test_slow_is_below_four_cycles_of_a_scan():
     place = (np.arange(100) + 0.5) / 100
     slow, fast = np.cos(6 * np.pi * place), np.cos(10 * np.pi * place)
-    np.testing.assert_allclose(slow_part(2 + slow + fast), slow, atol=1e-12)
+    np.testing.assert_allclose(below_four_cycles(2 + slow + fast), slow, atol=1e-12)
 
 
 def test_the_residual_is_told_where_it_is():

@@ -10,8 +10,8 @@ from clra.methods.alignment.reprojection import used_pixels
 from clra.methods.alignment.result import AlignmentResult
 from clra.methods.assessment.held_out import HeldOut
 from clra.methods.assessment.quality import Quality
+from clra.methods.assessment.standard_errors import apart_from_neighbours
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
-from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
@@ -24,8 +24,6 @@ Floats = NDArray[np.float64]
 # Held-out views of noisy scans lie beside their predictions by at most so many times what those of
 # their noiseless re-projections do: 1.4 times in v for balls of 128 pixels with 1e4 photons.
 _USUAL = 1.5
-# Points of the sample by which the gauge is known.
-_POINTS = 300
 
 
 def standard_errors(
@@ -65,9 +63,9 @@ def standard_errors(
     formal = np.sum(np.nanmean(sigma[valid, :2] ** 2, axis=0))
     sigma *= np.sqrt(1 + beyond / formal)
     # Rejected views have their neighbours' motion, and differ from it as neighbours do.
-    apart = motion.rotation[1:-1] - 0.5 * (motion.rotation[2:] + motion.rotation[:-2])
     sigma[~valid, :3] = judged.sigma[~valid, :3]
-    sigma[~valid, 3:] = np.hypot(sigma[~valid, 3:], np.sqrt(np.mean(apart**2, axis=0)))
+    apart = [apart_from_neighbours(column) for column in motion.rotation.T]
+    sigma[~valid, 3:] = np.hypot(sigma[~valid, 3:], apart)
     return sigma
 
 
@@ -103,12 +101,8 @@ def _apparent(stream: Stream, still: Scan, scale: bool) -> Floats:
         whole=True,
         stage="held-out views, simulated",
     )
-    held = np.flatnonzero(np.isfinite(predicted.residual))
-    u, v, m = predicted.shift[held].T
-    points = sample_points(default_grid(still.geometry), _POINTS)
-    gauge = Gauge(still.geometry.subset(held), points, magnification=scale)
-    left = gauge.fit(Motion(shift_u=u, shift_v=v, magnification=np.exp(m))).remainder
-    return np.asarray(np.sqrt(np.mean(left[:, :2] ** 2, axis=0)))
+    left = predicted.left(still.geometry, magnification=scale)
+    return np.asarray(np.sqrt(np.nanmean(left[:, :2] ** 2, axis=0)))
 
 
 def with_standard_errors(
