@@ -82,7 +82,8 @@ def align(
     schedule : str
         Levels and iterations, coarse to fine: "1QR-1HR", "2QR-2HR", "4FR", or "auto": at a
         detector of 384 pixels and more "6ER-3QR", else "4ER" and a quarter of the resolution
-        until converged (at most 20 iterations), then half until converged (at most 3; on smaller detectors 6).
+        until converged (at most 20 iterations), then half until converged (at most 3; on smaller
+        detectors 6).
         Where the motion is large, or the views are an arc of a parallel beam, "auto" begins with
         shifts by sums over the radiographs ("PA" in the history), and on other arcs with the column
         of the axis, if the rays that are measured twice tell one; ``Solver(prealign=False)``
