@@ -10,7 +10,7 @@
 
 #include "adjoint.clh"
 
-// What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, z) on.
+// What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, k = z) on.
 always_inlined void add_leaning(
     const pencil s,
     const float *m, // the view
@@ -136,10 +136,9 @@ kernel required_group void adjoint_leaning(
     const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2) * VOXELS;
     if (x >= nx || y >= ny || z >= nz)
         return;
+    volume += ((size_t)y * nx + x) * nz + z;
     float sum[VOXELS];
-#pragma unroll
-    for (int k = 0; k < VOXELS; ++k)
-        sum[k] = 0.0f;
+    fetch(sum, volume, 0, nz - z, accumulate);
     for (int view = 0; view < count; ++view) {
         LOAD_VIEW(m, views + view * VIEW_FLOATS);
         const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
@@ -147,9 +146,9 @@ kernel required_group void adjoint_leaning(
         const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]);
         const int x_too = far_x + (1.0f + SLACK) >= far_y, y_too = far_y + (1.0f + SLACK) >= far_x;
         if (x_too)
-            add_leaning(s, m, 0, x, y, z, y_too, sum);
+            add_leaning(s, m, 0, x, y, z + LIFT(m), y_too, sum);
         if (y_too)
-            add_leaning(s, m, 1, x, y, z, x_too, sum);
+            add_leaning(s, m, 1, x, y, z + LIFT(m), x_too, sum);
     }
-    put(volume + ((size_t)y * nx + x) * nz + z, sum, nz - z, accumulate);
+    put(volume, sum, 0, nz - z);
 }
