@@ -135,9 +135,10 @@ kernel required_group void adjoint_axial(
     const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2) * VOXELS;
     if (x >= nx || y >= ny || z >= nz)
         return;
-    volume += ((size_t)y * nx + x) * nz + z;
     float sum[VOXELS];
-    fetch(sum, volume, 0, nz - z, accumulate);
+#pragma unroll
+    for (int k = 0; k < VOXELS; ++k)
+        sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
         global const float *m = views + view * VIEW_FLOATS;
         const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
@@ -148,7 +149,7 @@ kernel required_group void adjoint_axial(
         if (far_y + (1.0f + SLACK) >= far_x)
             add_columns(s, m, 1, x, y, z + LIFT(m), sum);
     }
-    put(volume, sum, 0, nz - z);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, 0, nz - z, accumulate);
 }
 
 // What the rays that are sampled across axis p give one voxel, which projects to (column, row).

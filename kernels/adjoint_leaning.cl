@@ -136,9 +136,10 @@ kernel required_group void adjoint_leaning(
     const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2) * VOXELS;
     if (x >= nx || y >= ny || z >= nz)
         return;
-    volume += ((size_t)y * nx + x) * nz + z;
     float sum[VOXELS];
-    fetch(sum, volume, 0, nz - z, accumulate);
+#pragma unroll
+    for (int k = 0; k < VOXELS; ++k)
+        sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
         LOAD_VIEW(m, views + view * VIEW_FLOATS);
         const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
@@ -150,5 +151,5 @@ kernel required_group void adjoint_leaning(
         if (y_too)
             add_leaning(s, m, 1, x, y, z + LIFT(m), x_too, sum);
     }
-    put(volume, sum, 0, nz - z);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, 0, nz - z, accumulate);
 }

@@ -69,9 +69,10 @@ kernel required_group void backproject_axial(
         return;
     const float fx = x, fy = y;
     const float last_column = columns - 1.0f, last_row = rows - 1.0f;
-    volume += ((size_t)y * nx + x) * nz + z;
     float sum[VOXELS];
-    fetch(sum, volume, -z, top - z, accumulate);
+#pragma unroll
+    for (int k = 0; k < VOXELS; ++k)
+        sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
         global const float4 *m = (global const float4 *)(views + view * VIEW_FLOATS);
         const float4 pa = m[0], pb = m[1], pg = m[2]; // pa.z == pg.z == 0
@@ -109,7 +110,7 @@ kernel required_group void backproject_axial(
                     sum[k]);
         }
     }
-    put(volume, sum, -z, top - z);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, -z, top - z, accumulate);
 }
 
 // Any pose of the detector.
@@ -139,9 +140,10 @@ kernel required_group void backproject_voxels(
         return;
     const float fx = x, fy = y;
     const float last_column = columns - 1.0f, last_row = rows - 1.0f;
-    volume += ((size_t)y * nx + x) * nz + z;
     float sum[VOXELS];
-    fetch(sum, volume, -z, top - z, accumulate);
+#pragma unroll
+    for (int k = 0; k < VOXELS; ++k)
+        sum[k] = 0.0f;
     for (int view = 0; view < count; ++view) {
         global const float4 *m = (global const float4 *)(views + view * VIEW_FLOATS);
         const float4 pa = m[0], pb = m[1], pg = m[2];
@@ -191,5 +193,5 @@ kernel required_group void backproject_voxels(
             }
         }
     }
-    put(volume, sum, -z, top - z);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, -z, top - z, accumulate);
 }

@@ -131,6 +131,6 @@ kernel required_group void pi_backproject(
     volume += line * nz + z;
 #pragma unroll
     for (int k = 0; k < VOXELS; ++k)
-        if (k >= -z && k < voxels)
+        if ((uint)(z + k) < (uint)(z + voxels))
             volume[k] += sum[k] * share_of(spans, of_helix, helices, helix, (float)(plane + k));
 }
