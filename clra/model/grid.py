@@ -48,9 +48,7 @@ class VolumeGrid:
     shape: tuple[int, int, int]
     voxel_size: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    _cut: tuple[VolumeGrid, int] | None = field(
-        default=None, init=False, repr=False, compare=False
-    )
+    _cut: tuple[VolumeGrid, int] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if np.shape(self.shape) != (3,):

@@ -8,7 +8,8 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from clra.ops.projection.layout import ALIGNED, Layout
+from clra.ops.projection.layout import Layout
+from clra.ops.projection.view_table import ALIGNED
 from clra.ops.runtime.kernel import Step
 
 _GROUP = (32, 8, 1)

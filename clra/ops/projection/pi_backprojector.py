@@ -11,7 +11,8 @@ from clra.model.grid import VolumeGrid
 from clra.model.helix.helix import Helix
 from clra.model.helix.pi_intervals import pi_reach, pi_spans
 from clra.ops.projection.gpu_forms import size_constants
-from clra.ops.projection.layout import ALIGNED, Layout
+from clra.ops.projection.layout import Layout
+from clra.ops.projection.view_table import ALIGNED
 from clra.ops.runtime.buffers import Allocator, to_device
 from clra.ops.runtime.kernel import Step
 

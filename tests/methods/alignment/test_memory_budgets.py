@@ -6,8 +6,8 @@ import pytest
 import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
 
-# Of shifts [pixel] where the volume is cut: sums along rays round differently then, and registration
-# in float32 turns any rounding into as much for views at the ends, which see little of the sample.
+# Of shifts [pixel] where the volume is cut: sums along rays round differently then, and of any
+# rounding registration in float32 makes as much for views at the ends, which see little.
 SLABS = 1e-4
 
 
