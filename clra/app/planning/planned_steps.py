@@ -161,7 +161,7 @@ def _planes(
 
 
 def _binning(geometry: ConeBeamGeometry, level: int, workers: Workers) -> PlannedStep:
-    from clra.methods.execution.shared_level import view_chunks
+    from clra.methods.shared_work.shared_scan import view_chunks
 
     stored = 4.0 * geometry.views * geometry.rows * geometry.columns
     tasks = len(view_chunks(workers.count, geometry.views))
@@ -175,14 +175,14 @@ def _iteration(
     from clra.methods.alignment.options import Solver
     from clra.methods.alignment.reprojection import with_margin
     from clra.methods.execution.executor import slabs_of
-    from clra.methods.execution.level_tasks import planned_volumes
-    from clra.methods.execution.shared_level import view_chunks
+    from clra.methods.reconstruction.fitted_fbp import VOLUMES
+    from clra.methods.shared_work.shared_scan import view_chunks
 
     terms = Solver().terms
     binned = geometry.binned(level) if level > 1 else geometry
     grid = with_margin(full)
     grid = grid.binned(level) if level > 1 else grid
-    slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, planned_volumes(terms))
+    slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, VOLUMES if terms else 1)
     chunks = len(view_chunks(workers.count, geometry.views))
     seen = _views_of_slabs(binned, grid, len(slabs))
     view = float(binned.rows * binned.columns)

@@ -24,17 +24,18 @@ from clra.methods.execution.checkpoint import (
     checkpoint_of,
     identity,
 )
-from clra.methods.execution.choice import check_for_cluster
-from clra.methods.execution.shared_level import levels_on
+from clra.methods.execution.choice import check_for_cluster, executing
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.methods.shared_work.shared_level import levels_by
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
+from clra.ops.runtime.devices import usable_devices
 from clra.ops.runtime.versions import versions
 from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.stream import Stream
@@ -99,7 +100,8 @@ def align(
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
-        As :func:`clra.ops.runtime.devices.choose_device` takes it.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all" to share "ra" out to
+        all devices of the best kind.
     reference : Scan, optional
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.
@@ -167,8 +169,9 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
+    devices = usable_devices(device, progress)
     stream = Stream(
-        device,
+        devices[0],
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
         report=progress,
@@ -258,7 +261,10 @@ def align(
                     "max_device_memory": max_device_memory,
                     "max_host_memory": max_host_memory,
                 }
-                with levels_on(cluster, part, keeping, progress, limits) as run.make_level:
+                with executing(
+                    stream, devices, cluster, part, keeping, progress, limits
+                ) as executor:
+                    run.make_level = levels_by(executor, part)
                     run.align(stages, saved)
                 aligned = run.result()
                 if estimate in FREE and not cancelled(findings):

@@ -4,14 +4,12 @@ import logging
 import re
 import shutil
 import tempfile
-import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from clra.errors import ClusterError, InputError
-from clra.methods.execution.checkpoint import Checkpoint
 from clra.methods.execution.dask_cluster import DaskCluster
 from clra.methods.execution.travelling import check_travels
 from clra.model.scan import Scan
@@ -27,7 +25,7 @@ _CONNECTING = 30
 def on_cluster(
     cluster: Any,
     scan: Scan,
-    checkpoint: Checkpoint | None,
+    folder: Path,
     progress: ProgressCallback | None,
     limits: dict[str, Any],
 ) -> Iterator[DaskCluster]:
@@ -40,9 +38,7 @@ def on_cluster(
         machine, or "slurm:N" for N jobs as dask-jobqueue is configured.
     scan : Scan
         That the workers will read.
-    checkpoint : Checkpoint, optional
-        Of the call: files for the workers go beside it, else into the current folder.
-    progress, limits
+    folder, progress, limits
         As for :class:`DaskCluster`.
 
     Raises
@@ -56,7 +52,7 @@ def on_cluster(
     check_travels(scan)
     with ExitStack() as stack:
         client = stack.enter_context(_client(cluster)) if isinstance(cluster, str) else cluster
-        executor = DaskCluster(client, _folder(checkpoint), progress=progress, **limits)
+        executor = DaskCluster(client, folder, progress=progress, **limits)
         stack.callback(executor.close)
         yield executor
 
@@ -137,11 +133,3 @@ def _slurm(jobs: int) -> Iterator[Any]:
     with cluster:
         cluster.scale(jobs=jobs)
         yield cluster
-
-
-def _folder(checkpoint: Checkpoint | None) -> Path:
-    """Where the workers' files go."""
-    if checkpoint is None:
-        return Path(f"clra-{uuid.uuid4().hex[:8]}.tasks")
-    kept = checkpoint.folder
-    return kept.with_name(f"{kept.name.removesuffix('.resume')}.tasks")

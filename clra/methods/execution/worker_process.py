@@ -10,7 +10,6 @@ import platform
 import sys
 import threading
 import traceback
-import warnings
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,12 +140,10 @@ def run(path: str, item: Any, settings: Settings) -> Outcome:
     """
     with _lock:  # one device: tasks take turns, however many threads a worker has
         _prepare(settings.neighbours)
-        from clra.errors import ClraWarning
         from clra.findings import collected
 
         me = _name()
-        with collected() as findings, warnings.catch_warnings():
-            warnings.simplefilter("ignore", ClraWarning)  # told by the caller's process
+        with collected(silent=True) as findings:  # told by the caller's process
             try:
                 task = _task(path)
                 result = task(_stream(settings), item)

@@ -1,6 +1,6 @@
 """Radiographs of one resolution, read in chunks."""
 
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ class Radiographs:
         self._kept: KeptRadiographs | None = self._read_all() if level > 1 or keep else None
 
     @classmethod
-    def of(cls, kept: KeptRadiographs, level: int) -> "Radiographs":
+    def of(cls, kept: KeptRadiographs, level: int) -> Self:
         """Radiographs (views, rows, columns) of a level that are known already."""
         known = cls.__new__(cls)
         views, rows, columns = kept.shape
