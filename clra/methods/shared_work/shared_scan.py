@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.execution.executor import PARTS, Held, WorkerGroup, slabs_of
+from clra.methods.execution.executor import PARTS, Held, Task, WorkerGroup, slabs_of
 from clra.methods.reconstruction.fitted_fbp import VOLUMES, WINDOW
-from clra.methods.shared_work.tasks import Bin, Measured, ReconstructSlab, Simulate
+from clra.methods.shared_work.tasks import Bin, Measured, ReconstructSlab, Simulate, Tabulate
 from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
-from clra.ops.streaming.part_files import RadiographParts, VolumeParts
+from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream, equal_runs
 
@@ -137,6 +137,15 @@ class SharedScan:
         target = self.radiograph_parts("simulated", factor)
         self.workers.map(Simulate(volume, geometry, target, factor), target.parts, stage=stage)
         return SharedRadiographs.in_files(target, factor)
+
+    def table(self, work: Task[slice, NDArray[np.float64]], stage: str) -> NDArray[np.float64]:
+        """Do a task that returns rows (n, ...) for n views; return the rows of all views."""
+        target = TableParts(self.workers.new_folder("table"))
+        try:
+            self.workers.map(Tabulate(work, target), self.chunks, stage=stage)
+            return target.read(self.chunks)
+        finally:
+            shutil.rmtree(target.folder, ignore_errors=True)
 
     @property
     def chunks(self) -> tuple[slice, ...]:

@@ -1,4 +1,4 @@
-"""Radiographs and volumes in files that several processes share, each file written by one.
+"""Radiographs, tables and volumes in files that several processes share, each file written by one.
 
 A file appears whole or not at all. It is written under a name of its own and renamed, so that work
 that is done twice, because one worker seemed lost, writes the same file twice and does no harm.
@@ -8,7 +8,7 @@ import math
 import os
 import uuid
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -100,6 +100,31 @@ class SomeParts:
     def read(self, start: int, stop: int) -> Floats:
         """Return the views `start` to `stop - 1` of these."""
         return self.whole.read(self.views.start + start, self.views.start + stop)
+
+
+@dataclass(frozen=True)
+class TableParts:
+    """Numbers of each view, (views, ...), those of some consecutive views in each file.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the files.
+    """
+
+    folder: Path
+
+    def write(self, views: slice, rows: NDArray[np.float64]) -> None:
+        """Write what is known of some views."""
+        with whole_file(self._path(views)) as file:
+            np.save(file, rows)
+
+    def read(self, parts: Iterable[slice]) -> NDArray[np.float64]:
+        """Return what is known of all views, given those of each file in order."""
+        return np.concatenate([np.load(self._path(views)) for views in parts])
+
+    def _path(self, views: slice) -> Path:
+        return self.folder / f"rows-{views.start:06}"
 
 
 @dataclass(frozen=True)
