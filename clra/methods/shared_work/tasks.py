@@ -13,7 +13,7 @@ from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.radiographs import PerView, Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
@@ -79,6 +79,23 @@ class Tabulate:
     def __call__(self, stream: Stream, views: slice) -> None:
         """Do the work for views."""
         self.target.write(views, self.work(stream, views))
+
+
+@dataclass(frozen=True)
+class NumbersOf:
+    """Returns numbers of some radiographs."""
+
+    measured: Measured
+    numbers: PerView
+
+    def __call__(self, stream: Stream, views: slice) -> NDArray[np.float64]:
+        """Return rows (n, ...) for views."""
+        radiographs = self.measured.some(stream, views)
+
+        def numbers(images: NDArray[np.float32], part: slice) -> NDArray[np.float64]:
+            return self.numbers(images, slice(views.start + part.start, views.start + part.stop))
+
+        return radiographs.tabulated(stream, numbers, "reading")
 
 
 @dataclass(frozen=True)
