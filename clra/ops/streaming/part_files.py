@@ -8,7 +8,7 @@ import math
 import os
 import uuid
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,7 +26,7 @@ from clra.ops.streaming.volume import PlaneWriter, Volume
 
 Floats = NDArray[np.float32]
 
-# Bytes that are on the host at a time when planes are handed on.
+# Bytes that are on the host at a time when planes or radiographs are handed on.
 _PIECE_BYTES = 32 << 20
 
 
@@ -76,6 +76,13 @@ class RadiographParts:
                     file.seek((first - part.start) * stride)
                     _read_into(file, out[first - start : last - start])
         return out
+
+    def hand_on(self, views: slice, take: Callable[[int, Floats], None]) -> None:
+        """Give one of the parts to what takes all radiographs, some at a time; remove the file."""
+        step = max(1, _PIECE_BYTES // (4 * self.shape[1] * self.shape[2]))
+        for start, stop in pairwise([*range(views.start, views.stop, step), views.stop]):
+            take(start, self.read(start, stop))
+        self._path(views).unlink()
 
     def some(self, views: slice) -> "SomeParts":
         """Return consecutive views as radiographs of their own."""
