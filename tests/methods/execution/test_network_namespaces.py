@@ -82,7 +82,8 @@ def test_workers_that_share_a_folder_only(tmp_path):
         pytest.skip("no unshare, ip or mount")
     own = ["unshare", "--user", "--map-root-user", "--net", "--mount"]
     tried = subprocess.run(
-        [*own, "ip", "link", "add", "one", "type", "veth", "peer", "name", "two"], capture_output=True
+        [*own, "ip", "link", "add", "one", "type", "veth", "peer", "name", "two"],
+        capture_output=True,
     )
     if tried.returncode:
         pytest.skip("no network namespaces of one's own")
