@@ -84,7 +84,7 @@ def correct(
     def workers(
         folder: Path, progress: ProgressCallback | None
     ) -> AbstractContextManager[InProcess | WorkerGroup]:
-        return executing(stream, devices, cluster, scan, None, progress, limits, beside=folder)
+        return executing(stream, devices, cluster, None, progress, limits, beside=folder)
 
     return replace(found, projections=_CorrectedByWorkers(found.projections, scan, motion, workers))
 

@@ -25,7 +25,6 @@ def executing(
     stream: Stream,
     devices: Sequence[cl.Device],
     cluster: Any,
-    scan: Scan,
     checkpoint: Checkpoint | None,
     progress: ProgressCallback | None,
     limits: dict[str, Any],
@@ -45,13 +44,12 @@ def executing(
         those of several devices to where temporary files are.
     beside : Path, optional
         Folder for files of the work, in place of these.
-    cluster, scan, progress, limits
+    cluster, progress, limits
         As for :func:`clra.methods.execution.clusters.on_cluster`; None is no cluster.
     """
     if cluster is not None:
-        with on_cluster(
-            cluster, scan, _folder(checkpoint, beside or Path.cwd()), progress, limits
-        ) as workers:
+        folder = _folder(checkpoint, beside or Path.cwd())
+        with on_cluster(cluster, folder, progress, limits) as workers:
             yield workers
     elif len(devices) > 1:
         folder = _folder(checkpoint, beside or Path(tempfile.gettempdir()))
