@@ -49,9 +49,9 @@ def reads(monkeypatch):
     found = []
 
     def watched(read):
-        def reading(self, start, stop, **options):
+        def reading(self, start, stop, *rows, **options):
             found.append(stop - start)
-            return read(self, start, stop, **options)
+            return read(self, start, stop, *rows, **options)
 
         return reading
 
