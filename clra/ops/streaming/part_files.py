@@ -8,7 +8,7 @@ import math
 import os
 import uuid
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -62,8 +62,14 @@ class RadiographParts:
 
     def write(self, views: slice, images: Floats) -> None:
         """Write one of the parts."""
+        with self.writing(views) as write:
+            write(images)
+
+    @contextmanager
+    def writing(self, views: slice) -> Iterator[Callable[[Floats], None]]:
+        """Yield what takes the images of one of the parts, some after the other."""
         with whole_file(self._path(views)) as file:
-            file.write(_bytes(np.ascontiguousarray(images, np.float32)))
+            yield lambda images: _write(file, images)
 
     def read(self, start: int, stop: int) -> Floats:
         """Return the views `start` to `stop - 1`, of one file or several."""
@@ -226,7 +232,7 @@ class _PlanesOfFile:
 
     def write(self, start: int, part: Floats, /) -> None:
         self._file.seek(start * self._stride)
-        self._file.write(_bytes(np.ascontiguousarray(part, np.float32)))
+        _write(self._file, part)
 
 
 def _read_into(file: Any, array: Floats) -> None:
@@ -237,6 +243,10 @@ def _read_into(file: Any, array: Floats) -> None:
         if not count:
             raise OSError(f"{file.name}: ended early")
         view = view[count:]
+
+
+def _write(file: IO[bytes], images: Floats) -> None:
+    file.write(_bytes(np.ascontiguousarray(images, np.float32)))
 
 
 def _bytes(array: Floats) -> memoryview:

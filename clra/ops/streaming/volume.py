@@ -23,7 +23,29 @@ class PlaneWriter(Protocol):
         """Take planes (n, y, x), the first of them plane `start` of the volume."""
 
 
-class Volume:
+class KeptVolume(Protocol):
+    """Where a volume is kept, such as `Volume`.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+        Of the volume.
+    """
+
+    grid: VolumeGrid
+
+    def write(self, target: PlaneWriter) -> None:
+        """Hand the whole volume on, (z, y, x), some planes at a time."""
+        ...
+
+    def to_host(self) -> Floats:
+        """Return the whole volume as a numpy array (z, y, x)."""
+        target = HostPlanes(self.grid)
+        self.write(target)
+        return target.volume
+
+
+class Volume(KeptVolume):
     """A volume in the order (y, x, z), on the device if it fits, else in slabs on the host.
 
     Parameters
@@ -112,12 +134,6 @@ class Volume:
                 ny,
             )
             target.write(self._planes[index].start + start, stream.download(planes))
-
-    def to_host(self) -> Floats:
-        """Return the whole volume as a numpy array (z, y, x)."""
-        target = HostPlanes(self.grid)
-        self.write(target)
-        return target.volume
 
     def _start(self, index: int) -> int:
         """First element of a slab in the store."""
