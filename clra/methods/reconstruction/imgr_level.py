@@ -71,7 +71,7 @@ class MultigridLevel:
     @cached_property
     def radiographs(self) -> Radiographs:
         """The measured radiographs, binned when they are needed."""
-        return self._binned()  # 1: down-sample
+        return Radiographs(self.stream, self.scan, self.factor)  # 1: down-sample
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -210,9 +210,6 @@ class MultigridLevel:
     def cropped(self, volume: Any, first: int, grid: VolumeGrid) -> KeptVolume:
         """Return planes of a volume of this resolution, from `first` on; `grid` is theirs."""
         return cropped(self.stream, volume, first, grid)
-
-    def _binned(self) -> Radiographs:
-        return Radiographs(self.stream, self.scan, self.factor)
 
     def _compared(
         self, compare: RadiographComparison, volume: Any, motion: Motion, stage: str
