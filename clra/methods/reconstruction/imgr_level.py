@@ -13,8 +13,9 @@ from clra.methods.alignment.reprojection import (
     registration_for,
     reprojected,
 )
+from clra.methods.ordered_subsets.subset_rays import VOLUMES
 from clra.methods.reconstruction.fbp import ramp_fbp
-from clra.methods.reconstruction.osem_tr import VOLUMES, OrderedSubsets, osem_tr, start_volume
+from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
 from clra.methods.reconstruction.residuals import residuals
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
