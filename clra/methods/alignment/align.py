@@ -29,6 +29,7 @@ from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.methods.shared_work.shared_level import levels_by
+from clra.methods.shared_work.shared_multigrid_level import multigrid_levels_by
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -159,7 +160,7 @@ def align(
     _check(scan, method, estimate, gauge)
     if estimate == "source" and isinstance(motion, RigidMotion):
         raise InputError("motion: found a rigid one with estimate='source', expected shifts")
-    check_for_cluster(cluster, scan, method, ("ra",))
+    check_for_cluster(cluster, scan, method, ("ra", "imgr"))
     check_for_cluster(cluster, scan, estimate, [e for e in ESTIMATES if e not in FREE])
     keeping, own = checkpoint_of(checkpoint, resume)
     stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
@@ -170,12 +171,8 @@ def align(
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
     devices = usable_devices(device, progress)
-    stream = Stream(
-        devices[0],
-        max_device_memory=max_device_memory,
-        max_host_memory=max_host_memory,
-        report=progress,
-    )
+    limits = {"max_device_memory": max_device_memory, "max_host_memory": max_host_memory}
+    stream = Stream(devices[0], report=progress, **limits)
     anchor = gauge == "anchored" and method != "reference"
     begun: RigidStart | None = None
 
@@ -230,19 +227,21 @@ def align(
             saved = keeping.begin(identity(part, grid, options, motion=start))
         try:
             if method == "imgr":
-                aligned = _by_imgr(
-                    stream,
-                    part,
-                    grid,
-                    levels=schedule,
-                    align=True,
-                    scale=scale,
-                    anchor=anchor,
-                    motion=start,
-                    truth=truth,
-                    checkpoint=keeping,
-                    saved=saved,
-                )
+                with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+                    aligned = _by_imgr(
+                        stream,
+                        part,
+                        grid,
+                        levels=schedule,
+                        align=True,
+                        scale=scale,
+                        anchor=anchor,
+                        motion=start,
+                        truth=truth,
+                        checkpoint=keeping,
+                        saved=saved,
+                        make_level=multigrid_levels_by(executor, part),
+                    )
             else:
                 region = region_of(stream, part, grid, own=own_grid)
                 run = CoarseToFine(
@@ -257,10 +256,6 @@ def align(
                     truth,
                     keeping,
                 )
-                limits = {
-                    "max_device_memory": max_device_memory,
-                    "max_host_memory": max_host_memory,
-                }
                 with executing(stream, devices, cluster, keeping, progress, limits) as executor:
                     run.make_level = levels_by(executor, part)
                     run.align(stages, saved)

@@ -37,6 +37,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import converged, level_factor, level_name, parse_levels
 from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import CroppedVolume
 
 # Cycles after which it ends in any case; without alignment a second one changes little.
 _CYCLES, _CYCLES_UNALIGNED = 3, 1
@@ -153,7 +154,7 @@ def imgr(
             message = f"the reconstruction was ended early: it is that of {run.done.finished}"
             Finding("cancelled", message).warn()
         margin = (wide.shape[0] - grid.shape[0]) // 2
-        volume = run.level(1).cropped(run.full(), margin, grid)
+        volume = CroppedVolume(run.full(), margin, grid)
     except KeyboardInterrupt:
         if not run.done.steps:
             raise
@@ -205,7 +206,8 @@ class _Run:
         volume = self.done.volume
         for factor in (4, 2, 1):
             if factor < level_factor(self.done.steps[-1].level):
-                volume = self.level(factor).brought(volume, "full resolution")
+                # Not told: whoever ended the work early still wants what is finished.
+                volume = self.level(factor).brought(volume, None)
         return volume
 
     def _correct(self, level: MultigridLevel, cycle: int, title: str) -> ImgrState:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.reprojection import Registered, binned_mask, in_full_pixels
+from clra.methods.ordered_subsets.subset_rays import VOLUMES
 from clra.methods.reconstruction.fbp import ramp_fbp
-from clra.methods.reconstruction.osem_tr import VOLUMES, OrderedSubsets, osem_tr, start_volume
+from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
 from clra.methods.reconstruction.residuals import RadiographComparison, residuals
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -17,11 +18,10 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.view_selection import sampled
 from clra.ops.streaming.memory import Store
-from clra.ops.streaming.multigrid import cropped, prolongate, restrict
+from clra.ops.streaming.multigrid import prolongate, restrict
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.slab_projector import volume_from
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import KeptVolume
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -102,8 +102,8 @@ class MultigridLevel:
             valid_views=valid_views,
         )
 
-    def brought(self, volume: Any, title: str) -> Any:
-        """Bring the volume of the level before to this resolution."""
+    def brought(self, volume: Any, title: str | None) -> Any:
+        """Bring the volume of the level before to this resolution; without a title, untold."""
         if not self.lowest:  # 11, 17
             return prolongate(self.stream, volume, self.grid, volumes=self.volumes)
         for _ in range(self.factor.bit_length() - 1):  # 23
@@ -206,10 +206,6 @@ class MultigridLevel:
             stage=f"{title}: OSEM-TR",
         )
         return volume
-
-    def cropped(self, volume: Any, first: int, grid: VolumeGrid) -> KeptVolume:
-        """Return planes of a volume of this resolution, from `first` on; `grid` is theirs."""
-        return cropped(self.stream, volume, first, grid)
 
     def _compared(
         self, compare: RadiographComparison, volume: Any, motion: Motion, stage: str

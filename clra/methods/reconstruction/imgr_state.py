@@ -20,7 +20,7 @@ from clra.methods.execution.packing import (
 )
 from clra.model.motion import Motion
 from clra.model.schedule import level_factor
-from clra.ops.streaming.volume import KeptVolume
+from clra.ops.streaming.volume import PlaneSource
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ImgrState:
 
     Attributes
     ----------
-    volume : KeptVolume or None
+    volume : PlaneSource or None
         At the resolution of the last level, on the grid with its margin.
     motion : Motion
         Of the radiographs.
@@ -69,7 +69,7 @@ class ImgrState:
         By that registration, with its gauge.
     """
 
-    volume: KeptVolume | None
+    volume: PlaneSource | None
     motion: Motion
     rejected: NDArray[np.bool_]
     steps: tuple[ImgrStep, ...] = ()
@@ -99,7 +99,7 @@ class ImgrState:
         checkpoint.save(self.finished, values, arrays, self.volume)
 
     @classmethod
-    def kept(cls, saved: Saved, restored: Callable[[int, Any], KeptVolume]) -> "ImgrState":
+    def kept(cls, saved: Saved, restored: Callable[[int, Any], PlaneSource]) -> "ImgrState":
         """Return a state that was kept.
 
         Parameters
@@ -147,7 +147,7 @@ class MultigridResult:
 
     Attributes
     ----------
-    volume : KeptVolume
+    volume : PlaneSource
         Attenuation [1/mm].
     motion : Motion
         Of the radiographs, estimated or given.
@@ -157,7 +157,7 @@ class MultigridResult:
         Where it aligned.
     """
 
-    volume: KeptVolume
+    volume: PlaneSource
     motion: Motion
     steps: tuple[ImgrStep, ...]
     alignment: AlignmentResult | None

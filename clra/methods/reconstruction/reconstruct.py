@@ -230,7 +230,7 @@ def reconstruct_into(
         valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
         valid_views = checked_valid_views(valid_views, scan.views)
-    check_for_cluster(cluster, scan, method, ("fbp", "katsevich"))
+    check_for_cluster(cluster, scan, method, METHODS)
     options = iterative.checked_options(method, options)
     keeping, own = checkpoint_of(checkpoint, resume)
     if keeping is not None and keeping.resume and options is None and not align:
@@ -278,13 +278,13 @@ def reconstruct_into(
             there = scan.views if valid_views is None else int(valid_views.sum())
             _warn_of_gaps(fitted, grid, there)
         steps: tuple[ImgrStep, ...] = ()
-        if options is not None:
-            request = iterative.Request(scan, grid, motion, align, valid_views, options)
-            steps, found = iterative.iterate(stream, target, request, keeping)
-            alignment = found or alignment
-        else:
-            work = SomePlanes(scan, grid, motion, valid_views, fitted, window)
-            with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+        with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+            if options is not None:
+                request = iterative.Request(scan, grid, motion, align, valid_views, options)
+                steps, found = iterative.iterate(executor, stream, target, request, keeping)
+                alignment = found or alignment
+            else:
+                work = SomePlanes(scan, grid, motion, valid_views, fitted, window)
                 reconstruct_planes(executor, work, grid.shape, target, stage="back-projecting")
     if own and keeping is not None and not cancelled(findings):
         keeping.clear()

@@ -19,11 +19,9 @@ from clra.methods.shared_work.multigrid_tasks import (
     SubtractSimulated,
 )
 from clra.methods.shared_work.shared_ordered_subsets import shared_osem_tr, shared_start_volume
-from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan
-from clra.methods.shared_work.shared_volume import SharedVolume
+from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan, SharedVolume
 from clra.methods.shared_work.tasks import ReconstructSlab
 from clra.methods.truncation import extension
-from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.view_selection import sampled
@@ -52,11 +50,11 @@ class SharedMultigridLevel(MultigridLevel):
     def restored(self, planes: NDArray[np.float32]) -> SharedVolume:
         """Return a volume that was kept, copied: what keeps it is replaced later on."""
         parts = self.shared.volume_parts(self.grid, self.volumes)
-        return self._by_slab(RestoreSlab(planes, parts), "reading what was kept")
+        return self._by_slab(RestoreSlab(planes, parts), "reading what was kept", "checkpoint")
 
     def first(self, motion: Motion, valid_views: Bools) -> SharedVolume:
         """Return the volume to start from: steps 1 and 2."""
-        return self._of(
+        return self.shared.source(
             shared_start_volume(
                 self.shared,
                 self.stream,
@@ -68,14 +66,14 @@ class SharedMultigridLevel(MultigridLevel):
             )
         )
 
-    def brought(self, volume: SharedVolume, title: str) -> SharedVolume:
-        """Bring the volume of the level before to this resolution."""
+    def brought(self, volume: SharedVolume, title: str | None) -> SharedVolume:
+        """Bring the volume of the level before to this resolution; without a title, untold."""
         if not self.lowest:
             fine = self.shared.volume_parts(self.grid, self.volumes)
-            return self._by_slab(ProlongateSlab(volume.parts, fine), f"{title}: prolongating")
+            return self._by_slab(ProlongateSlab(volume.parts, fine), "prolongating", title)
         for _ in range(self.factor.bit_length() - 1):
             coarse = self.shared.volume_parts(volume.grid.binned(2), self.volumes)
-            volume = self._by_slab(RestrictSlab(volume.parts, coarse), f"{title}: restricting")
+            volume = self._by_slab(RestrictSlab(volume.parts, coarse), "restricting", title)
         return volume
 
     def corrected(
@@ -102,7 +100,7 @@ class SharedMultigridLevel(MultigridLevel):
         }
         target = self.shared.volume_parts(self.grid, self.volumes)
         task = ReconstructSlab(left.measured, geometry, target, options, onto=volume.parts)
-        return self._by_slab(task, f"{title}: correcting")
+        return self._by_slab(task, "correcting", title)
 
     def reconstruct(
         self, volume: SharedVolume, motion: Motion, valid_views: Bools, title: str
@@ -119,11 +117,7 @@ class SharedMultigridLevel(MultigridLevel):
             valid_views=valid_views,
             stage=f"{title}: OSEM-TR",
         )
-        return self._of(parts)
-
-    def cropped(self, volume: SharedVolume, first: int, grid: VolumeGrid) -> SharedVolume:
-        """Return planes of a volume of this resolution, from `first` on; `grid` is theirs."""
-        return SharedVolume(self.shared.workers, volume.parts, grid, first)
+        return self.shared.source(parts)
 
     def _compared(
         self, compare: RadiographComparison, volume: SharedVolume, motion: Motion, stage: str
@@ -142,14 +136,16 @@ class SharedMultigridLevel(MultigridLevel):
         table = np.concatenate([part for _, part in found]) if compare.registering else None
         return simulated, sum(deviance for deviance, _ in found), table
 
-    def _by_slab(self, task: Any, stage: str) -> SharedVolume:
+    def _by_slab(self, task: Any, doing: str, title: str | None) -> SharedVolume:
         """Do a task with each slab of its target; return that."""
         target: VolumeParts = task.target
-        self.shared.workers.map(task, range(len(target.planes)), stage=stage)
-        return self._of(target)
-
-    def _of(self, parts: VolumeParts) -> SharedVolume:
-        return SharedVolume(self.shared.workers, parts, parts.grid)
+        self.shared.workers.map(
+            task,
+            range(len(target.planes)),
+            stage=f"{title or 'full resolution'}: {doing}",
+            part=None if title is None else (0, 1),
+        )
+        return self.shared.source(target)
 
 
 def multigrid_levels_by(

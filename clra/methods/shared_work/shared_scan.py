@@ -7,9 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.execution.executor import PARTS, Held, WorkerGroup, slabs_of
+from clra.methods.execution.executor import (
+    PARTS,
+    Held,
+    WorkerGroup,
+    reconstruct_planes,
+    slabs_of,
+)
 from clra.methods.reconstruction.fitted_fbp import VOLUMES, WINDOW
-from clra.methods.shared_work.tasks import Bin, Measured, ReconstructSlab, Simulate
+from clra.methods.shared_work.tasks import Bin, HandOn, Measured, ReconstructSlab, Simulate
 from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -17,6 +23,7 @@ from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream, equal_runs
+from clra.ops.streaming.volume import PlaneSource, PlaneWriter
 
 # Views of a task at most: what a worker that is killed loses, and what one keeps on its host.
 _MOST_VIEWS = 1024
@@ -138,15 +145,22 @@ class SharedScan:
         self.workers.map(Simulate(volume, geometry, target, factor), target.parts, stage=stage)
         return SharedRadiographs.in_files(target, factor)
 
+    def source(self, volume: VolumeParts) -> "SharedVolume":
+        """Return a volume in files as one that can be handed on."""
+        return SharedVolume(self.workers, volume)
+
     @property
     def chunks(self) -> tuple[slice, ...]:
         """Views of each task."""
         return view_chunks(self.workers.places, self.scan.views)
 
-    def radiograph_parts(self, name: str, factor: int) -> RadiographParts:
-        """Return files for radiographs of a level."""
-        shape = (self.scan.views, *self.scan.geometry.binned(factor).shape)
-        parts = RadiographParts(self.workers.new_folder(name), shape, self.chunks)
+    def radiograph_parts(
+        self, name: str, factor: int, chunks: tuple[slice, ...] | None = None
+    ) -> RadiographParts:
+        """Return files for radiographs of a level: of all views, or of as many as chunks hold."""
+        chunks = chunks or self.chunks
+        shape = (chunks[-1].stop, *self.scan.geometry.binned(factor).shape)
+        parts = RadiographParts(self.workers.new_folder(name), shape, chunks)
         weakref.finalize(parts, shutil.rmtree, parts.folder, ignore_errors=True)
         return parts
 
@@ -159,7 +173,41 @@ class SharedScan:
         return parts
 
 
-def view_chunks(places: int, views: int) -> tuple[slice, ...]:
+class SharedVolume(PlaneSource):
+    """A volume in files that workers hand on, so that the caller holds few planes at a time.
+
+    Parameters
+    ----------
+    workers : WorkerGroup
+        Who does the work.
+    parts : VolumeParts
+        The files.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+        Of the volume.
+    parts : VolumeParts
+        The files.
+    """
+
+    def __init__(self, workers: WorkerGroup, parts: VolumeParts) -> None:
+        self.grid, self.parts = parts.grid, parts
+        self._workers = workers
+
+    def write(self, target: PlaneWriter, planes: slice | None = None) -> None:
+        """Hand planes on; see :class:`clra.ops.streaming.volume.PlaneSource`."""
+        nz, ny, nx = self.grid.shape
+        wanted = planes or slice(0, nz)
+        shape = (wanted.stop - wanted.start, ny, nx)
+        task = HandOn(self.parts, wanted.start)
+        # Not told: whoever ended the work early still wants what is finished.
+        reconstruct_planes(
+            self._workers, task, shape, target, stage="writing the volume", part=None
+        )
+
+
+def view_chunks(places: int, views: int, each: int = PARTS) -> tuple[slice, ...]:
     """Cut views into tasks: some for each worker, none of many views."""
-    count = max(PARTS * places, -(-views // _MOST_VIEWS))
+    count = max(each * places, -(-views // _MOST_VIEWS))
     return tuple(equal_runs(views, min(views, count)))
