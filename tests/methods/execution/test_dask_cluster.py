@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulation import paper_like, sample, simulated_scan
 from clra.errors import Cancelled, ClusterError
 from clra.methods.execution import worker_facts, worker_process
 from clra.methods.execution.dask_cluster import DaskCluster
@@ -22,48 +21,6 @@ distributed = pytest.importorskip("distributed")
 VOLUME, VOXEL = 3e-6, 2e-4
 # Motions of an alignment, after two levels [pixel].
 MOTION = 1e-4
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dask")
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            memory_limit=None,
-            dashboard_address=":0",
-            silence_logs=50,
-            local_directory=str(folder),
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
-
-
-@pytest.fixture(autouse=True)
-def _own_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-def scan_file(path, kind, views, size=64):
-    geometry = paper_like(kind, views, (size, size))
-    random = np.random.default_rng(3)
-    truth = clra.Motion(
-        shift_u=random.normal(0, 1, views),
-        shift_v=random.normal(0, 1, views),
-        magnification=np.ones(views),
-    )
-    clra.write_scan(path, simulated_scan(geometry, sample("spheres", geometry), truth, name=kind))
-    return clra.read_scan(path)
-
-
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scans")
-    # As few views a turn as Katsevich's method takes.
-    views = {"helix": 320, "space-filling": 160}
-    return {kind: scan_file(folder / f"{kind}.nxs", kind, n) for kind, n in views.items()}
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +116,7 @@ def test_radiographs_in_memory_are_refused(client, scans):
 @pytest.mark.parametrize(
     ("call", "expected"),
     [
-        (lambda scan, on: clra.reconstruct(scan, "imgr", cluster=on), "found 'imgr'"),
+        (lambda scan, on: clra.align(scan, method="reference", cluster=on), "found 'reference'"),
         (lambda scan, on: clra.align(scan, estimate="rigid", cluster=on), "found 'rigid'"),
         (lambda scan, on: clra.align(scan, cluster="node1"), "expected ADDRESS"),
         (lambda scan, on: clra.align(scan, cluster=3), "expected a distributed"),

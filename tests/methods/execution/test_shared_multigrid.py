@@ -1,0 +1,59 @@
+"""Multigrid reconstruction by several workers gives what a single process gives."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+import clra
+from clra.errors import Cancelled
+from clra.methods.reconstruction.iterative import Multigrid
+from tests.methods.execution.conftest import scan_file
+
+# Relative norm of volumes, with the motion known and with that found [pixel].
+VOLUME, ALIGNED, MOTION = 1e-6, 3e-6, 3e-5
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return scan_file(tmp_path_factory.mktemp("multigrid") / "scan.nxs", "space-filling", 96)
+
+
+def apart(one, other):
+    return np.linalg.norm(one - other) / np.linalg.norm(other)
+
+
+def test_a_volume(client, scan, tmp_path):
+    options = {"motion": scan.truth, "options": Multigrid(cycles=2, passes=1)}
+    alone = clra.reconstruct(scan, "imgr", **options)
+    assert apart(clra.reconstruct(scan, "imgr", cluster=client, **options), alone) < VOLUME
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_alignment_that_loses_a_worker_and_its_client(client, scan, tmp_path):
+    killed = []
+
+    def disturb(progress):
+        if progress.stage == "cycle 1, HR: simulating" and progress.done == 2 and not killed:
+            killed.append(next(iter(client.run(os.getpid).values())))
+            os.kill(killed[0], signal.SIGKILL)
+        if progress.stage == "cycle 1, FR: correcting":
+            raise Cancelled
+
+    options = {"method": "imgr", "quality": False}
+    alone = clra.align(scan, **options)
+    options |= {"cluster": client, "checkpoint": tmp_path / "kept"}
+    with pytest.warns(clra.ClraWarning, match="it is that of cycle 1 up to HR"):
+        early = clra.align(scan, progress=disturb, **options)
+    assert killed
+    assert early.volume.shape == alone.volume.shape
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+    stages = []
+    again = clra.align(scan, progress=lambda p: stages.append(p.stage), resume=True, **options)
+    assert not any(stage.startswith("cycle 1, HR") for stage in stages)
+    for one, other in zip(again.motion.columns(), alone.motion.columns(), strict=True):
+        assert np.abs(one - other).max() < MOTION
+    assert apart(again.volume, alone.volume) < ALIGNED
+    assert [i.misfit for i in again.history] == pytest.approx([i.misfit for i in alone.history])
+    assert list(tmp_path.iterdir()) == []
