@@ -261,9 +261,7 @@ def align(
                     "max_device_memory": max_device_memory,
                     "max_host_memory": max_host_memory,
                 }
-                with executing(
-                    stream, devices, cluster, part, keeping, progress, limits
-                ) as executor:
+                with executing(stream, devices, cluster, keeping, progress, limits) as executor:
                     run.make_level = levels_by(executor, part)
                     run.align(stages, saved)
                 aligned = run.result()

@@ -25,7 +25,6 @@ def executing(
     stream: Stream,
     devices: Sequence[cl.Device],
     cluster: Any,
-    scan: Scan,
     checkpoint: Checkpoint | None,
     progress: ProgressCallback | None,
     limits: dict[str, Any],
@@ -41,13 +40,12 @@ def executing(
     checkpoint : Checkpoint, optional
         Of the call: files of the work go beside it; else a cluster's into the current folder, and
         those of several devices to where temporary files are.
-    cluster, scan, progress, limits
+    cluster, progress, limits
         As for :func:`clra.methods.execution.clusters.on_cluster`; None is no cluster.
     """
     if cluster is not None:
-        with on_cluster(
-            cluster, scan, _folder(checkpoint, Path.cwd()), progress, limits
-        ) as workers:
+        folder = _folder(checkpoint, Path.cwd())
+        with on_cluster(cluster, folder, progress, limits) as workers:
             yield workers
     elif len(devices) > 1:
         folder = _folder(checkpoint, Path(tempfile.gettempdir()))

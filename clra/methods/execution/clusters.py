@@ -11,8 +11,6 @@ from typing import Any
 
 from clra.errors import ClusterError, InputError
 from clra.methods.execution.dask_cluster import DaskCluster
-from clra.methods.execution.travelling import check_travels
-from clra.model.scan import Scan
 from clra.progress import ProgressCallback
 
 CHOICES = "ADDRESS|FILE|local:N|slurm:N"
@@ -24,7 +22,6 @@ _CONNECTING = 30
 @contextmanager
 def on_cluster(
     cluster: Any,
-    scan: Scan,
     folder: Path,
     progress: ProgressCallback | None,
     limits: dict[str, Any],
@@ -36,20 +33,16 @@ def on_cluster(
     cluster : distributed.Client or str
         A client; or the address of a scheduler, its file, "local:N" for N worker processes on this
         machine, or "slurm:N" for N jobs as dask-jobqueue is configured.
-    scan : Scan
-        That the workers will read.
     folder, progress, limits
         As for :class:`DaskCluster`.
 
     Raises
     ------
     InputError
-        If dask.distributed is not installed, the text is none of these, or the scan is in memory
-        only.
+        If dask.distributed is not installed, or the text is none of these.
     ClusterError
         If there is no scheduler, or as :class:`DaskCluster` raises it.
     """
-    check_travels(scan)
     with ExitStack() as stack:
         client = stack.enter_context(_client(cluster)) if isinstance(cluster, str) else cluster
         executor = DaskCluster(client, folder, progress=progress, **limits)

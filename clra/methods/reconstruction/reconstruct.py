@@ -280,7 +280,7 @@ def reconstruct_into(
         steps: tuple[ImgrStep, ...] = ()
         if method == "imgr":
             devices = devices[:1]
-        with executing(stream, devices, cluster, scan, keeping, progress, limits) as executor:
+        with executing(stream, devices, cluster, keeping, progress, limits) as executor:
             if options is not None:
                 request = iterative.Request(scan, grid, motion, align, valid_views, options)
                 steps, found = iterative.iterate(executor, stream, target, request, keeping)
