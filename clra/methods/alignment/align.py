@@ -101,8 +101,8 @@ def align(
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
-        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all" to share "ra" out to
-        all devices of the best kind.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all" to share the work out
+        to all devices of the best kind.
     reference : Scan, optional
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.
@@ -133,9 +133,10 @@ def align(
         Whether to judge the result by views that are held out: a verdict, and standard errors that
         count what is left. A motion that predicts them no better than the start is not returned.
     cluster : distributed.Client or str, optional
-        Workers that reconstruct, project and register for "ra", but for `estimate` "rigid" and
-        those with a roll: a client of Dask, or "local:N", "slurm:N", the address of a scheduler or
-        its file. The scan has to be in a file. What is left for the device here is small.
+        Workers that reconstruct, project and register for "ra" and "imgr", but for `estimate`
+        "rigid" and those with a roll: a client of Dask, or "local:N", "slurm:N", the address of a
+        scheduler or its file. The scan has to be in a file. What is left for the device here is
+        small.
 
     Returns
     -------
