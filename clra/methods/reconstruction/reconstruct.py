@@ -82,7 +82,7 @@ def reconstruct(
         way.
     device : str or cl.Device, optional
         As `choose_device` takes it, or "all" to share the work out to all devices of the best kind;
-        alignment and iterative methods take the first of them.
+        "imgr" takes the first of them.
     alignment : AlignmentResult, optional
         In place of `motion`: views that it rejects are left out.
     valid_views : ndarray of bool, (views,), optional
@@ -111,8 +111,9 @@ def reconstruct(
     window : {"ram-lak", "shepp-logan", "hann"}
         Of the ramp filter of "fbp": the latter two trade resolution for less noise.
     cluster : distributed.Client or str, optional
-        Workers to share "fbp" or "katsevich" out to, and an alignment: a client of Dask, or
-        "local:N", "slurm:N", the address of a scheduler or its file. The scan has to be in a file.
+        Workers to share "fbp", "katsevich" or "osem-tr" out to, and an alignment: a client of
+        Dask, or "local:N", "slurm:N", the address of a scheduler or its file. The scan has to be in
+        a file.
 
     Returns
     -------
@@ -261,7 +262,7 @@ def reconstruct_into(
                 keeping.resume = keeping.there if begun.resume else keeping.resume
             alignment = align_scan(
                 scan,
-                device=devices[0],
+                device=device,
                 progress=progress,
                 checkpoint=begun,
                 cluster=cluster,

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulation import paper_like, sample, simulated_scan
 from clra.errors import Cancelled, ClusterError
 from clra.methods.execution import worker_facts, worker_process
 from clra.methods.execution.dask_cluster import DaskCluster
@@ -24,46 +23,14 @@ VOLUME, VOXEL = 3e-6, 2e-4
 MOTION = 1e-4
 
 
-@pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dask")
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            memory_limit=None,
-            dashboard_address=":0",
-            silence_logs=50,
-            local_directory=str(folder),
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
-
-
-@pytest.fixture(autouse=True)
-def _own_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-def scan_file(path, kind, views, size=64):
-    geometry = paper_like(kind, views, (size, size))
-    random = np.random.default_rng(3)
-    truth = clra.Motion(
-        shift_u=random.normal(0, 1, views),
-        shift_v=random.normal(0, 1, views),
-        magnification=np.ones(views),
-    )
-    clra.write_scan(path, simulated_scan(geometry, sample("spheres", geometry), truth, name=kind))
-    return clra.read_scan(path)
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 
 @pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scans")
+def scans(scan_file):
     # As few views a turn as Katsevich's method takes.
     views = {"helix": 320, "space-filling": 160}
-    return {kind: scan_file(folder / f"{kind}.nxs", kind, n) for kind, n in views.items()}
+    return {kind: scan_file(kind, n, 64) for kind, n in views.items()}
 
 
 @pytest.fixture(scope="module")
@@ -222,6 +189,20 @@ def test_results_keep_the_order_of_the_items(cluster):
     results = cluster.map(lambda stream, item: item**2, range(9), stage="s", done=done.append)
     assert results == [item**2 for item in range(9)]
     assert sorted(done) == list(range(9))
+
+
+def test_calls_that_are_a_stage_together(client, tmp_path):
+    told = []
+    executor = DaskCluster(client, tmp_path / "tasks", progress=told.append)
+    told.clear()
+    try:
+        for part in ((0, 2), None, (1, 2)):
+            executor.map(lambda stream, item: item, range(3), stage="s", part=part)
+    finally:
+        executor.close()
+    assert {progress.total for progress in told} == {6}
+    assert sorted({progress.done for progress in told}) == list(range(7))
+    assert [progress.done for progress in told] == sorted(progress.done for progress in told)
 
 
 def test_workers_share_the_cores(client, cluster):
