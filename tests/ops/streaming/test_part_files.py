@@ -1,12 +1,16 @@
 """Radiographs and volumes in files of several workers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import clra
 from clra.ops.streaming import part_files
+from clra.ops.streaming.memory import Store
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
-from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.slab_projector import ConstantVolume, SlabProjector, volume_from
+from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import HostPlanes
 
 SHAPE = (7, 5, 3)
@@ -52,3 +56,34 @@ def test_some_planes_of_a_volume(stream, tmp_path, wanted):
     )
     parts.volume(stream).write(target, wanted)
     np.testing.assert_array_equal(target.volume, values[wanted])
+
+
+def test_all_views_are_projected_with_each_slab_read_once(stream, tmp_path, monkeypatch):
+    # A helix that sees the slabs one after the other, and nothing at its ends.
+    flat = clra.circular(24, source_to_axis=5, source_to_detector=50, pixel_size=1.0, shape=(8, 16))
+    height = np.outer(np.linspace(-2.5, 2.5, 24), [0, 0, 1])
+    geometry = replace(flat, source=flat.source + height, detector=flat.detector + height)
+    grid = clra.VolumeGrid(shape=(21, 9, 11), voxel_size=0.1)
+    values = np.random.default_rng(4).uniform(size=grid.shape).astype(np.float32)
+    parts = VolumeParts(tmp_path, grid, tuple(equal_runs(21, 3)))
+    for index in range(3):
+        parts.write_planes(index, values)
+    read, get = [], VolumeParts.read
+    monkeypatch.setattr(VolumeParts, "read", lambda *args: read.append(args[2]) or get(*args))
+    kept = Store((24, 8, 16), stream.room)
+    kept.write(0, np.full((24, 8, 16), np.nan, np.float32))
+    monkeypatch.setattr(stream, "chunks", lambda views, size: equal_runs(views, -(-views // 5)))
+    SlabProjector(stream, parts.volume(stream), geometry).project_all(stream, kept)
+    assert read == [0, 1, 2]
+    expected = stream.empty((24, 8, 16))
+    SlabProjector(stream, volume_from(stream, grid, values), geometry)(expected, slice(0, 24))
+    expected = stream.download(expected)
+    assert (expected == 0).all(axis=(1, 2)).any() and expected.any()
+    np.testing.assert_allclose(kept.read(0, 24), expected, atol=1e-6 * expected.max())
+
+
+def test_a_volume_of_one_value(stream):
+    grid = clra.VolumeGrid(shape=SHAPE, voxel_size=1.0)
+    volume = ConstantVolume(stream, grid, 0.5, volumes=stream.budgets.slab // (3 * 60))
+    assert len(volume.planes) > 1
+    np.testing.assert_array_equal(volume.to_host(), np.full(SHAPE, 0.5, np.float32))
