@@ -247,6 +247,30 @@ def test_a_worker_without_a_device_gets_no_tasks(client, monkeypatch, tmp_path):
     assert (executor.places, set(names)) == (1, {0})
 
 
+def test_a_task_takes_the_gpu_that_its_worker_was_started_with(tmp_path):
+    """Workers of several threads do not pile tasks up, which wait for one device."""
+
+    def running(stream, item):
+        worker = distributed.get_worker()
+        return worker.state.executing_count, dict(worker.state.available_resources)
+
+    with (
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=4,
+            resources={"GPU": 1},
+            memory_limit=None,
+            dashboard_address=":0",
+            local_directory=str(tmp_path / "dask"),
+        ) as local,
+        distributed.Client(local, set_as_default=False) as client,
+    ):
+        executor = DaskCluster(client, tmp_path / "tasks")
+        found = executor.map(running, range(6), stage="s")
+        executor.close()
+    assert found == 6 * [(1, {"GPU": 0})]
+
+
 def test_a_scan_travels_as_paths(scans, tmp_path):
     scan = scans["helix"]
     write_task(tmp_path / "task", scan)
