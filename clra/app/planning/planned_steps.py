@@ -153,7 +153,8 @@ def _planes(
     from clra.methods.execution.executor import slabs_of
 
     tasks = len(slabs_of(workers.count, workers.slab_bytes, grid.shape))
-    seen = _views_of_slabs(geometry, grid, tasks)
+    seen, rows = _seen_by_slabs(geometry, grid, tasks)
+    # A scan is read view by view, and of each what is needed is filtered.
     pixels = seen * geometry.rows * geometry.columns
     speed = workers.speed
     if exact:
@@ -161,7 +162,7 @@ def _planes(
     else:
         updates = math.prod(grid.shape) * views_a_voxel(geometry, grid)
         updates += _COVERAGE * math.prod(grid.shape)
-        seconds = updates * speed.back + pixels * speed.filtering
+        seconds = updates * speed.back + rows * geometry.columns * speed.filtering
         seconds += _COLUMN * (seen - geometry.views) * math.prod(grid.shape[1:]) * speed.back
     seconds += pixels * _READ_S * workers.slowdown
     # What workers write the client reads again, and writes into the output.
@@ -191,24 +192,25 @@ def _iteration(
     grid = grid.binned(level) if level > 1 else grid
     slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, VOLUMES if terms else 1)
     chunks = len(view_chunks(workers.count, geometry.views))
-    seen = _views_of_slabs(binned, grid, len(slabs))
+    seen, rows = _seen_by_slabs(binned, grid, len(slabs))
+    looked_at = rows * binned.columns
     view = float(binned.rows * binned.columns)
     updates = math.prod(grid.shape) * views_a_voxel(binned, grid)
     speed = workers.speed
     again = max(0.0, seen - binned.views) * math.prod(grid.shape[1:])
     covered = _COVERAGE * math.prod(grid.shape)
-    back = (updates + covered + _COLUMN * again) * speed.back + seen * view * speed.filtering
+    back = (updates + covered + _COLUMN * again) * speed.back + looked_at * speed.filtering
     forward = updates * speed.forward
     # Each chunk of views reads the slabs that it sees.
     looked = chunks * math.ceil(len(slabs) * min(1.0, seen / len(slabs) / binned.views) + 1)
     looked = min(looked, chunks * len(slabs))
     volume, images = _bytes(grid), 4.0 * binned.views * view
     fetched = volume * looked / len(slabs)
-    steps = [PlannedStep("reconstructing", len(slabs), back, 4 * seen * view, volume)]
+    steps = [PlannedStep("reconstructing", len(slabs), back, 4 * looked_at, volume)]
     for _ in range(terms):
         steps += [
             PlannedStep("simulating", chunks, forward, fetched + images, images),
-            PlannedStep("correcting", len(slabs), back, 4 * seen * view + volume, volume),
+            PlannedStep("correcting", len(slabs), back, 4 * looked_at + volume, volume),
         ]
     registering = binned.views * view * speed.registering
     return [
@@ -217,13 +219,20 @@ def _iteration(
     ]
 
 
-def _views_of_slabs(geometry: ConeBeamGeometry, grid: VolumeGrid, slabs: int) -> float:
-    """Add up the views that see each of some slabs: so many are read and filtered."""
-    from clra.model.view_selection import views_that_see
+def _seen_by_slabs(geometry: ConeBeamGeometry, grid: VolumeGrid, slabs: int) -> tuple[float, float]:
+    """Add up the views that see each of some slabs, and their rows that do."""
+    from clra.model.view_selection import rows_that_see, views_that_see
     from clra.ops.streaming.stream import equal_runs
 
-    parts = equal_runs(grid.shape[0], min(slabs, grid.shape[0]))
-    return float(sum(views_that_see(geometry, grid.slab(p.start, p.stop)).sum() for p in parts))
+    views = rows = 0
+    radius = 0.5 * grid.shape[2] * grid.voxel_size
+    for part in equal_runs(grid.shape[0], min(slabs, grid.shape[0])):
+        slab = grid.slab(part.start, part.stop)
+        seeing = views_that_see(geometry, slab)
+        low, high = rows_that_see(geometry, slab, radius)[seeing].T
+        views += int(seeing.sum())
+        rows += int((high - low).sum())
+    return float(views), float(rows)
 
 
 def _is_helical(geometry: ConeBeamGeometry) -> bool:

@@ -39,6 +39,8 @@ class WorkerFacts:
         Bytes that the device has and gives at once, and that the machine has free.
     shared : bool
         Whether the device works in the machine's memory.
+    gpu : bool
+        Whether the worker was started with Dask's resource "GPU".
     """
 
     host: str
@@ -48,6 +50,7 @@ class WorkerFacts:
     largest_buffer: int = 0
     host_memory: int = 0
     shared: bool = False
+    gpu: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,6 +126,7 @@ def facts(neighbours: int, shared_file: str) -> WorkerFacts:
             largest_buffer=device.max_mem_alloc_size,
             host_memory=host_memory(),
             shared=profile_of(device).shared_memory,
+            gpu=_resources().get("GPU", 0) >= 1,
         )
 
 
@@ -182,6 +186,13 @@ def _number() -> int | None:
 
     name = get_worker().name
     return name if isinstance(name, int) else None
+
+
+def _resources() -> dict[str, float]:
+    """Return what the worker was started with, such as {"GPU": 1}."""
+    from distributed import get_worker
+
+    return dict(get_worker().state.total_resources)
 
 
 def _name() -> tuple[str, str]:

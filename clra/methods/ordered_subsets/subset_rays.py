@@ -8,7 +8,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.statistics.poisson import RayStatistics
 from clra.ops.streaming.radiographs import Radiographs
-from clra.ops.streaming.slab_projector import SlabProjector, constant_volume
+from clra.ops.streaming.slab_projector import ConstantVolume, SlabProjector
 from clra.ops.streaming.stream import Stream
 
 VOLUMES = 4
@@ -62,15 +62,13 @@ class SubsetRays:
         self._stream.queue.finish()  # before the host's radiographs may go
         return weighted
 
-    def compared(
-        self, project: SlabProjector, views: slice, update: str
-    ) -> tuple[Array, Array | None]:
-        """Compare some views with their projections, whose deviance is added to the sum.
+    def compared(self, simulated: Array, views: slice, update: str) -> tuple[Array, Array | None]:
+        """Compare some views with their projections; the deviance is added to the sum.
 
         Parameters
         ----------
-        project : SlabProjector
-            Of the volume, by the geometry of these rays.
+        simulated : Array
+            Line integrals of the volume (n, rows, columns); changed.
         views : slice
             In their order here.
         update : str
@@ -83,7 +81,7 @@ class SubsetRays:
             where it is precomputed.
         """
         queue, statistics = self._stream.queue, self._statistics
-        measured, simulated = self._measured(views), self._integrals(project, views)
+        measured = self._measured(views)
         statistics.deviance(queue, simulated, measured)
         other = None
         if update == "multiplicative":
@@ -97,6 +95,12 @@ class SubsetRays:
         queue.finish()  # before the host's radiographs may go
         return simulated, other
 
+    def projected(self, project: SlabProjector, views: slice) -> Array:
+        """Project a volume, by the geometry of these rays, into some views."""
+        integrals = self._stream.empty((views.stop - views.start, *self._geometry.shape))
+        project(integrals, views)
+        return integrals
+
     def release(self) -> None:
         """Let go of what lengths of rays are computed from."""
         self._chords = None
@@ -109,11 +113,6 @@ class SubsetRays:
     def _lengths(self, views: slice) -> Array:
         """Length of each ray within the volume [mm]."""
         if self._chords is None:
-            ones = constant_volume(self._stream, self._grid, 1.0, volumes=VOLUMES)
+            ones = ConstantVolume(self._stream, self._grid, 1.0, volumes=VOLUMES)
             self._chords = SlabProjector(self._stream, ones, self._geometry)
-        return self._integrals(self._chords, views)
-
-    def _integrals(self, project: SlabProjector, views: slice) -> Array:
-        integrals = self._stream.empty((views.stop - views.start, *self._geometry.shape))
-        project(integrals, views)
-        return integrals
+        return self.projected(self._chords, views)

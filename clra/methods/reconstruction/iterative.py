@@ -1,7 +1,8 @@
 """Volumes by iterative methods: their options, and where their results go."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -180,30 +181,35 @@ def _ordered_subsets(
             kept = f"{number} of {options.passes} passes"
             checkpoint.save(kept, {"passes": number}, {}, volume)
 
+    raising: Callable[[], object]
+    if isinstance(executor, InProcess):
+        radiographs = Radiographs(stream, scan, 1)
+        so_far = volume = start_volume(
+            stream, radiographs, geometry, wide, options, valid_views=request.valid_views
+        )
+        raising = partial(
+            osem_tr, stream, radiographs, geometry, volume, options, after_pass=keep, **how
+        )
+    else:
+        shared = SharedScan(executor, scan)
+        given = shared.binned(stream, 1)
+        parts = shared_start_volume(
+            shared, stream, given, geometry, wide, options, valid_views=request.valid_views
+        )
+        so_far = shared.source(parts)
+        raising = partial(
+            shared_osem_tr,
+            shared,
+            stream,
+            given,
+            geometry,
+            parts,
+            options,
+            after_pass=lambda number, parts: keep(number, shared.source(parts)),
+            **how,
+        )
     try:
-        if isinstance(executor, InProcess):
-            radiographs = Radiographs(stream, scan, 1)
-            so_far = volume = start_volume(
-                stream, radiographs, geometry, wide, options, valid_views=request.valid_views
-            )
-            osem_tr(stream, radiographs, geometry, volume, options, after_pass=keep, **how)
-        else:
-            shared = SharedScan(executor, scan)
-            given = shared.binned(stream, 1)
-            parts = shared_start_volume(
-                shared, stream, given, geometry, wide, options, valid_views=request.valid_views
-            )
-            so_far = shared.source(parts)
-            shared_osem_tr(
-                shared,
-                stream,
-                given,
-                geometry,
-                parts,
-                options,
-                after_pass=lambda number, parts: keep(number, shared.source(parts)),
-                **how,
-            )
+        raising()
     except Cancelled:
         if not passes:
             raise

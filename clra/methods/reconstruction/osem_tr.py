@@ -20,6 +20,7 @@ from clra.ops.statistics.poisson import RayStatistics
 from clra.ops.streaming.multigrid import add_update
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.slab_projector import (
+    ConstantVolume,
     SlabAdjoint,
     SlabProjector,
     constant_volume,
@@ -219,7 +220,7 @@ def ray_sums(
 
     Parameters are as for :func:`start_volume`.
     """
-    project = SlabProjector(stream, constant_volume(stream, grid, 1.0, volumes=VOLUMES), geometry)
+    project = SlabProjector(stream, ConstantVolume(stream, grid, 1.0, volumes=VOLUMES), geometry)
     integrals = lengths = 0.0
     for views in stream.chunks(geometry.views, radiographs.view_bytes):
         lengths_of = stream.empty((views.stop - views.start, *geometry.shape))
@@ -281,7 +282,8 @@ class _InOneProcess:
         denominator = self._denominator if rule.precomputed else self._zeros()
         for run in self._runs[subset]:
             stream.report(stage, self._seen, self._views)
-            above, below = self._rays.compared(self._project, run, rule.update)
+            simulated = self._rays.projected(self._project, run)
+            above, below = self._rays.compared(simulated, run, rule.update)
             self._adjoint(numerator, above, run)
             if below is not None:
                 self._adjoint(denominator, below, run)

@@ -260,7 +260,7 @@ def reconstruct_into(
                 keeping.resume = keeping.there if begun.resume else keeping.resume
             alignment = align_scan(
                 scan,
-                device="all" if len(devices) > 1 else devices[0],
+                device=device,
                 progress=progress,
                 checkpoint=begun,
                 cluster=cluster,

@@ -71,16 +71,23 @@ class RadiographParts:
         with whole_file(self._path(views)) as file:
             yield lambda images: _write_to(file, images)
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Return the views `start` to `stop - 1`, of one file or several."""
-        out = np.empty((stop - start, *self.shape[1:]), np.float32)
-        stride = 4 * self.shape[1] * self.shape[2]
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Return the views `start` to `stop - 1`, or rows of them, of one file or several."""
+        _, height, columns = self.shape
+        wanted = rows or slice(0, height)
+        out = np.empty((stop - start, wanted.stop - wanted.start, columns), np.float32)
         for part in self.parts:
             first, last = max(start, part.start), min(stop, part.stop)
-            if first < last:
-                with open(self._path(part), "rb", buffering=0) as file:
-                    file.seek((first - part.start) * stride)
-                    _read_into(file, out[first - start : last - start])
+            if first >= last:
+                continue
+            with open(self._path(part), "rb", buffering=0) as file:
+                pieces = [slice(first, last)]
+                if rows is not None:
+                    pieces = [slice(view, view + 1) for view in range(first, last)]
+                for views in pieces:
+                    row = (views.start - part.start) * height + wanted.start
+                    file.seek(4 * row * columns)
+                    _read_into(file, out[views.start - start : views.stop - start])
         return out
 
     def some(self, views: slice) -> "SomeParts":
@@ -103,9 +110,9 @@ class SomeParts:
         """Views, rows, columns."""
         return (self.views.stop - self.views.start, *self.whole.shape[1:])
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Return the views `start` to `stop - 1` of these."""
-        return self.whole.read(self.views.start + start, self.views.start + stop)
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Return the views `start` to `stop - 1` of these, or rows of them."""
+        return self.whole.read(self.views.start + start, self.views.start + stop, rows)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ class KeptRadiographs(Protocol):
         """Views, rows, columns."""
         ...
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Return the views `start` to `stop - 1`."""
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Return the views `start` to `stop - 1`, or some successive rows of them."""
         ...
 
 
@@ -77,16 +77,24 @@ class Radiographs:
         """Bytes of one radiograph at this level."""
         return 4 * self.shape[1] * self.shape[2]
 
-    def read(self, views: slice) -> Floats:
-        """Radiographs `views`, float32 (n, rows, columns)."""
-        if self._kept is None:
-            return self._scan.read(views.start, views.stop)
-        return self._kept.read(views.start, views.stop)
+    def read(self, views: slice, rows: slice | None = None) -> Floats:
+        """Radiographs `views`, or some rows of them, float32 (n, rows, columns)."""
+        if self._kept is not None:
+            return self._kept.read(views.start, views.stop, rows)
+        whole = self._scan.read(views.start, views.stop)
+        return whole if rows is None else np.ascontiguousarray(whole[:, rows])
 
-    def on_device(self, stream: Stream, views: slice) -> Array:
-        """Radiographs `views` on a stream's device; they have to stay as they are."""
+    def stay_on(self, stream: Stream) -> bool:
+        """Whether a stream's device keeps them: then it has all rows."""
+        return self._uploaded is not None and keeps(stream.budgets, self.shape)
+
+    def on_device(self, stream: Stream, views: slice, rows: slice | None = None) -> Array:
+        """Radiographs `views` on a stream's device, or some rows of those that do not stay there.
+
+        They have to stay as they are.
+        """
         if self._uploaded is None or not keeps(stream.budgets, self.shape):
-            return stream.upload(self.read(views))
+            return stream.upload(self.read(views, rows))
         if self._resident is None:
             self._resident = stream.empty(self.shape)
         for run in runs(~self._uploaded[views]):

@@ -23,6 +23,16 @@ VOLUME, VOXEL = 3e-6, 2e-4
 MOTION = 1e-4
 
 
+pytestmark = pytest.mark.usefixtures("own_folder")
+
+
+@pytest.fixture(scope="module")
+def scans(scan_file):
+    # As few views a turn as Katsevich's method takes.
+    views = {"helix": 320, "space-filling": 160}
+    return {kind: scan_file(kind, n, 64) for kind, n in views.items()}
+
+
 @pytest.fixture(scope="module")
 def alone(scans):
     return {
@@ -181,6 +191,20 @@ def test_results_keep_the_order_of_the_items(cluster):
     assert sorted(done) == list(range(9))
 
 
+def test_calls_that_are_a_stage_together(client, tmp_path):
+    told = []
+    executor = DaskCluster(client, tmp_path / "tasks", progress=told.append)
+    told.clear()
+    try:
+        for part in ((0, 2), None, (1, 2)):
+            executor.map(lambda stream, item: item, range(3), stage="s", part=part)
+    finally:
+        executor.close()
+    assert {progress.total for progress in told} == {6}
+    assert sorted({progress.done for progress in told}) == list(range(7))
+    assert [progress.done for progress in told] == sorted(progress.done for progress in told)
+
+
 def test_workers_share_the_cores(client, cluster):
     def cores(stream, item):
         return stream.device.max_compute_units, os.environ["POCL_MAX_PTHREAD_COUNT"]
@@ -221,6 +245,30 @@ def test_a_worker_without_a_device_gets_no_tasks(client, monkeypatch, tmp_path):
     finally:
         executor.close()
     assert (executor.places, set(names)) == (1, {0})
+
+
+def test_a_task_takes_the_gpu_that_its_worker_was_started_with(tmp_path):
+    """Workers of several threads do not pile tasks up, which wait for one device."""
+
+    def running(stream, item):
+        worker = distributed.get_worker()
+        return worker.state.executing_count, dict(worker.state.available_resources)
+
+    with (
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=4,
+            resources={"GPU": 1},
+            memory_limit=None,
+            dashboard_address=":0",
+            local_directory=str(tmp_path / "dask"),
+        ) as local,
+        distributed.Client(local, set_as_default=False) as client,
+    ):
+        executor = DaskCluster(client, tmp_path / "tasks")
+        found = executor.map(running, range(6), stage="s")
+        executor.close()
+    assert found == 6 * [(1, {"GPU": 0})]
 
 
 def test_a_scan_travels_as_paths(scans, tmp_path):

@@ -8,16 +8,16 @@ import pytest
 
 import clra
 from clra.errors import Cancelled
-from clra.methods.reconstruction.iterative import Multigrid
-from tests.methods.execution.conftest import scan_file
+
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 # Relative norm of volumes, with the motion known and with that found [pixel].
 VOLUME, ALIGNED, MOTION = 1e-6, 3e-6, 3e-5
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory):
-    return scan_file(tmp_path_factory.mktemp("multigrid") / "scan.nxs", "space-filling", 96)
+def scan(scan_file):
+    return scan_file("space-filling", 96, 64)
 
 
 def apart(one, other):
@@ -25,7 +25,7 @@ def apart(one, other):
 
 
 def test_a_volume(client, scan, tmp_path):
-    options = {"motion": scan.truth, "options": Multigrid(cycles=2, passes=1)}
+    options = {"motion": scan.truth, "options": clra.Multigrid(cycles=2, passes=1)}
     alone = clra.reconstruct(scan, "imgr", **options)
     assert apart(clra.reconstruct(scan, "imgr", cluster=client, **options), alone) < VOLUME
     assert list(tmp_path.iterdir()) == []
