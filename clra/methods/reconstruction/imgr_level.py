@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.alignment.reprojection import Registered, binned_mask, in_full_pixels
+from clra.methods.alignment.reprojection import Registered, binned_mask, in_full_pixels, reprojected
 from clra.methods.ordered_subsets.subset_rays import VOLUMES
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
@@ -212,14 +212,13 @@ class MultigridLevel:
     ) -> tuple[Any, float, Floats | None]:
         """Return what is simulated, and what :class:`RadiographComparison` does."""
         simulated = Store(self.radiographs.shape, self.stream.room)
+        pairs = reprojected(self.stream, self.radiographs, volume, self.geometry(motion), stage)
         deviance, table = compare(
             self.stream,
             self.scan,
             self.radiographs,
-            volume,
-            self.geometry(motion),
+            pairs,
             motion.magnification,
             simulated.write,
-            stage,
         )
         return simulated, deviance, table

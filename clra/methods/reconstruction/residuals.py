@@ -1,14 +1,14 @@
 """Measured radiographs and simulated ones: compared, registered, and what is left between them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pyopencl.array import Array
 
-from clra.methods.alignment.reprojection import register, registration_for, reprojected
+from clra.methods.alignment.reprojection import register, registration_for
 from clra.methods.reconstruction.osem_tr import OrderedSubsets
-from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.ops.images.warp import Warp
@@ -17,7 +17,6 @@ from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import Residual
 from clra.ops.streaming.radiographs import KeptRadiographs, Radiographs
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
 
@@ -159,13 +158,11 @@ class RadiographComparison:
         stream: Stream,
         scan: Scan,
         radiographs: Radiographs,
-        volume: Volume,
-        geometry: ConeBeamGeometry,
+        pairs: Iterable[tuple[slice, Array, Array]],
         known: Floats,
         keep: Callable[[int, NDArray[np.float32]], None],
-        stage: str,
     ) -> tuple[float, Floats | None]:
-        """Simulate and compare.
+        """Compare.
 
         Parameters
         ----------
@@ -175,17 +172,14 @@ class RadiographComparison:
             At full resolution, with its mask.
         radiographs : Radiographs
             As measured.
-        volume : Volume
-            To project.
-        geometry : ConeBeamGeometry
-            Of the radiographs, with the motion known so far absorbed.
+        pairs : iterable
+            These and simulated ones, as :func:`clra.methods.alignment.reprojection.reprojected`
+            yields them.
         known : ndarray, (views,)
-            Magnification that it has absorbed.
+            Magnification that the simulation was made with.
         keep : callable
             Takes the simulated radiographs (n, rows, columns) with the number of the first of them,
             in their order.
-        stage : str
-            What progress reports call this.
 
         Returns
         -------
@@ -202,8 +196,8 @@ class RadiographComparison:
             first=self.first,
             magnification=self.magnification,
         ) if self.registering else None  # fmt: skip
-        table = np.empty((geometry.views, len(ESTIMATE_FIELDS))) if self.registering else None
-        for views, measured, made in reprojected(stream, radiographs, volume, geometry, stage):
+        table = np.empty((radiographs.shape[0], len(ESTIMATE_FIELDS))) if self.registering else None
+        for views, measured, made in pairs:
             statistics.deviance(stream.queue, made, measured)
             keep(views.start, stream.download(made))
             if registration is not None and table is not None:
