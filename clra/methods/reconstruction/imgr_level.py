@@ -103,7 +103,7 @@ class MultigridLevel:
         )
 
     def brought(self, volume: Any, title: str | None) -> Any:
-        """Bring the volume of the level before to this resolution; without a title, untold."""
+        """Bring the volume of the level before to this resolution; no title, no reports."""
         if not self.lowest:  # 11, 17
             return prolongate(self.stream, volume, self.grid, volumes=self.volumes)
         for _ in range(self.factor.bit_length() - 1):  # 23

@@ -67,7 +67,7 @@ class SharedMultigridLevel(MultigridLevel):
         )
 
     def brought(self, volume: SharedVolume, title: str | None) -> SharedVolume:
-        """Bring the volume of the level before to this resolution; without a title, untold."""
+        """Bring the volume of the level before to this resolution; no title, no reports."""
         if not self.lowest:
             fine = self.shared.volume_parts(self.grid, self.volumes)
             return self._by_slab(ProlongateSlab(volume.parts, fine), "prolongating", title)
