@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.ordered_subsets.passes import StepRule, raise_likelihood
-from clra.methods.ordered_subsets.subset_rays import VOLUMES
 from clra.methods.reconstruction.osem_tr import FLOOR, OrderedSubsets, mean_attenuation
 from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan, view_chunks
 from clra.methods.shared_work.subset_tasks import (
@@ -29,6 +28,9 @@ from clra.model.grid import VolumeGrid
 from clra.model.subsets import Views, ordered_subsets
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.stream import Stream
+
+SLABS = 3
+"""Slabs that a task has on its device: of the volume, of the numerator and of the denominator."""
 
 
 def shared_start_volume(
@@ -70,19 +72,19 @@ def shared_start_volume(
     if options.initial == "uniform":
         return _written(shared, grid, np.broadcast_to(np.float32(mean), grid.shape))
     chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
-    volume = shared.volume_parts(grid, VOLUMES)
+    volume = shared.volume_parts(grid, SLABS)
     slabs = range(len(volume.planes))
     fbp: dict[str, Any] = {
         "valid_views": chosen,
         "positive": True,
         "extend": extension(radiographs, geometry, chosen),
-        "volumes": VOLUMES,
+        "volumes": SLABS,
     }
     task = ReconstructSlab(radiographs.measured, geometry, volume, fbp)
     shared.workers.map(task, slabs, stage="back-projecting")
     if not options.needs_mean:
         return volume
-    raised = shared.volume_parts(grid, VOLUMES)
+    raised = shared.like(volume)
     shared.workers.map(RaiseSlab(volume, raised, FLOOR * mean), slabs, stage="raising voxels of 0")
     return raised
 
@@ -108,7 +110,7 @@ def shared_osem_tr(
     shared, stream, radiographs
         As for :func:`shared_start_volume`.
     volume : VolumeParts
-        To start from, in the slabs that :func:`shared_start_volume` makes; left as it is.
+        To start from, in slabs of which a device holds `SLABS`; left as it is.
     geometry, options, used, valid_views, stage, done, after_pass
         As there.
 
@@ -180,7 +182,7 @@ class _SharedWork:
             self._denominator, self._largest = self._back_projected(
                 below, views, stage, (first + 1, count)
             )
-        target = self._shared.volume_parts(views.grid, VOLUMES)
+        target = self._shared.like(self.volume)
         step = StepSlab(
             self.volume,
             above,
@@ -201,7 +203,7 @@ class _SharedWork:
         self, images: RadiographParts, views: SubsetViews, stage: str, part: tuple[int, int]
     ) -> tuple[VolumeParts, float]:
         """Back-project into files; their largest value."""
-        target = self._shared.volume_parts(views.grid, VOLUMES)
+        target = self._shared.like(self.volume)
         task = BackProjectSlab(images, views.geometry, target)
         return target, max(self._shared.workers.map(task, self._slabs, stage=stage, part=part))
 
@@ -210,7 +212,7 @@ def _written(shared: SharedScan, grid: VolumeGrid, values: NDArray[Any]) -> Volu
     """Write a volume (z, y, x) that the caller has, where it is not negative, into files."""
     if tuple(values.shape) != grid.shape:
         raise InputError(f"volume: found shape {tuple(values.shape)}, expected {grid.shape}")
-    volume = shared.volume_parts(grid, VOLUMES)
+    volume = shared.volume_parts(grid, SLABS)
     for index in range(len(volume.planes)):
         volume.write_planes(index, values)
     return volume
