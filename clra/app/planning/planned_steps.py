@@ -225,13 +225,13 @@ def _ordered_subsets(
 ) -> list[PlannedStep]:
     """Return the steps of OSEM-TR by its defaults, as `shared_osem_tr` has them."""
     from clra.methods.execution.executor import slabs_of
+    from clra.methods.ordered_subsets.subset_rays import VOLUMES
     from clra.methods.reconstruction.osem_tr import OrderedSubsets
-    from clra.methods.shared_work.shared_ordered_subsets import SLABS
     from clra.methods.shared_work.shared_scan import view_chunks
 
     options, speed = OrderedSubsets(), workers.speed
     subsets = options.share_out(geometry, grid, None)
-    tasks = len(slabs_of(workers.count, workers.slab_bytes, grid.shape, SLABS))
+    tasks = len(slabs_of(workers.count, workers.slab_bytes, grid.shape, VOLUMES))
     seen, rows = _seen_by_slabs(geometry, grid, tasks)
     pixels = float(geometry.rows * geometry.columns)
     volume, images = _bytes(grid), 4.0 * pixels * geometry.views

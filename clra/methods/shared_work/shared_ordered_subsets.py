@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from clra.errors import InputError
 from clra.methods.ordered_subsets.passes import StepRule, raise_likelihood
+from clra.methods.ordered_subsets.subset_rays import VOLUMES
 from clra.methods.reconstruction.osem_tr import FLOOR, OrderedSubsets, mean_attenuation
 from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan, view_chunks
 from clra.methods.shared_work.subset_tasks import (
@@ -28,9 +29,6 @@ from clra.model.grid import VolumeGrid
 from clra.model.subsets import Views, ordered_subsets
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.stream import Stream
-
-SLABS = 3
-"""Slabs that a task has on its device: of the volume, of the numerator and of the denominator."""
 
 
 def shared_start_volume(
@@ -72,13 +70,13 @@ def shared_start_volume(
     if options.initial == "uniform":
         return _written(shared, grid, np.broadcast_to(np.float32(mean), grid.shape))
     chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
-    volume = shared.volume_parts(grid, SLABS)
+    volume = shared.volume_parts(grid, VOLUMES)
     slabs = range(len(volume.planes))
     fbp: dict[str, Any] = {
         "valid_views": chosen,
         "positive": True,
         "extend": extension(radiographs, geometry, chosen),
-        "volumes": SLABS,
+        "volumes": VOLUMES,
     }
     task = ReconstructSlab(radiographs.measured, geometry, volume, fbp)
     shared.workers.map(task, slabs, stage="back-projecting")
@@ -110,7 +108,7 @@ def shared_osem_tr(
     shared, stream, radiographs
         As for :func:`shared_start_volume`.
     volume : VolumeParts
-        To start from, in slabs of which a device holds `SLABS`; left as it is.
+        To start from, in slabs of which a device holds `VOLUMES`; left as it is.
     geometry, options, used, valid_views, stage, done, after_pass
         As there.
 
@@ -212,7 +210,7 @@ def _written(shared: SharedScan, grid: VolumeGrid, values: NDArray[Any]) -> Volu
     """Write a volume (z, y, x) that the caller has, where it is not negative, into files."""
     if tuple(values.shape) != grid.shape:
         raise InputError(f"volume: found shape {tuple(values.shape)}, expected {grid.shape}")
-    volume = shared.volume_parts(grid, SLABS)
+    volume = shared.volume_parts(grid, VOLUMES)
     for index in range(len(volume.planes)):
         volume.write_planes(index, values)
     return volume
