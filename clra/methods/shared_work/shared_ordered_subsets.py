@@ -82,7 +82,7 @@ def shared_start_volume(
     shared.workers.map(task, slabs, stage="back-projecting")
     if not options.needs_mean:
         return volume
-    raised = shared.volume_parts(grid, VOLUMES)
+    raised = shared.like(volume)
     shared.workers.map(RaiseSlab(volume, raised, FLOOR * mean), slabs, stage="raising voxels of 0")
     return raised
 
@@ -108,7 +108,7 @@ def shared_osem_tr(
     shared, stream, radiographs
         As for :func:`shared_start_volume`.
     volume : VolumeParts
-        To start from, in the slabs that :func:`shared_start_volume` makes; left as it is.
+        To start from, in slabs of which a device holds `VOLUMES`; left as it is.
     geometry, options, used, valid_views, stage, done, after_pass
         As there.
 
@@ -180,7 +180,7 @@ class _SharedWork:
             self._denominator, self._largest = self._back_projected(
                 below, views, stage, (first + 1, count)
             )
-        target = self._shared.volume_parts(views.grid, VOLUMES)
+        target = self._shared.like(self.volume)
         step = StepSlab(
             self.volume,
             above,
@@ -201,7 +201,7 @@ class _SharedWork:
         self, images: RadiographParts, views: SubsetViews, stage: str, part: tuple[int, int]
     ) -> tuple[VolumeParts, float]:
         """Back-project into files; their largest value."""
-        target = self._shared.volume_parts(views.grid, VOLUMES)
+        target = self._shared.like(self.volume)
         task = BackProjectSlab(images, views.geometry, target)
         return target, max(self._shared.workers.map(task, self._slabs, stage=stage, part=part))
 

@@ -128,7 +128,7 @@ class SharedScan:
                 volume, geometry, lacking, radiographs.level, radiographs.measured, used
             )
             self.workers.map(simulate, lacking.parts, stage=f"{stage}: simulating")
-            corrected = self.volume_parts(grid, options["volumes"])
+            corrected = self.like(volume)
             source = Measured(radiographs.level, lacking)
             task = ReconstructSlab(
                 source, geometry, corrected, options | {"window": WINDOW}, onto=volume
@@ -168,7 +168,14 @@ class SharedScan:
         """Return files for a volume, of whose kind a device holds `volumes` slabs at a time."""
         workers = self.workers
         planes = tuple(slabs_of(workers.places, workers.slab_bytes, grid.shape, volumes))
-        parts = VolumeParts(workers.new_folder("volume"), grid, planes)
+        return self._in_slabs(grid, planes)
+
+    def like(self, volume: VolumeParts) -> VolumeParts:
+        """Return files for another volume in the same slabs."""
+        return self._in_slabs(volume.grid, volume.planes)
+
+    def _in_slabs(self, grid: VolumeGrid, planes: tuple[slice, ...]) -> VolumeParts:
+        parts = VolumeParts(self.workers.new_folder("volume"), grid, planes)
         weakref.finalize(parts, shutil.rmtree, parts.folder, ignore_errors=True)
         return parts
 

@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from clra.methods.execution.executor import Held
 from clra.methods.ordered_subsets.passes import StepRule
-from clra.methods.ordered_subsets.subset_rays import VOLUMES, SubsetRays
+from clra.methods.ordered_subsets.subset_rays import SubsetRays
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, ray_sums
 from clra.methods.shared_work.tasks import Measured
 from clra.model.geometry import ConeBeamGeometry
@@ -21,7 +21,6 @@ from clra.ops.streaming.multigrid import add_to_slab
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.slab_projector import SlabAdjoint, SlabProjector, constant_volume
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import Volume
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class RaiseSlab:
     def __call__(self, stream: Stream, index: int) -> None:
         """Add it to slab `index`, into a file of its own."""
         grid = self.volume.grid.slab(*_ends(self.volume.planes[index]))
-        raised = constant_volume(stream, grid, self.value, volumes=VOLUMES)
+        raised = constant_volume(stream, grid, self.value)
         add_to_slab(stream, raised, 0, self.volume.read(stream, index))
         self.target.write(stream, index, raised.get(0))
 
@@ -162,6 +161,7 @@ class CompareViews:
                 part = stream.empty((run.stop - run.start, *geometry.shape))
                 part.set(simulated.read(run.start, run.stop), queue=stream.queue)
                 made = rays.compared(part, run, update)
+                # the second is for nobody where the denominator is precomputed
                 for write, images in zip(takers, made, strict=False):
                     assert images is not None
                     write(stream.download(images))
@@ -241,7 +241,7 @@ def back_projected(
 ) -> Array:
     """Return the adjoint of images, (ny, nx, planes) of slab `index` of a volume's parts."""
     grid = parts.grid.slab(*_ends(parts.planes[index]))
-    total: Volume = constant_volume(stream, grid, volumes=VOLUMES)
+    total = constant_volume(stream, grid)
     assert len(total.planes) == 1  # slabs are cut to what the smallest device takes
     adjoint = SlabAdjoint(stream, total, geometry)
     view_bytes = 4 * images.shape[1] * images.shape[2]

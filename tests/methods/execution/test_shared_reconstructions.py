@@ -110,7 +110,7 @@ def test_a_coarse_level_in_little_memory(scan, tmp_path):
     radiographs, how = Radiographs(stream, scan, 2), options()
     volume = start_volume(stream, radiographs, binned, grid, how)
     misfits = osem_tr(stream, radiographs, binned, volume, how, used=used)
-    executor = SeveralDevices([device, device], tmp_path / "tasks", max_device_memory=200 << 10)
+    executor = SeveralDevices([device, device], tmp_path / "tasks", max_device_memory=150 << 10)
     shared = SharedScan(executor, scan)
     given, target = shared.binned(stream, 2), HostPlanes(grid)
     parts = shared_start_volume(shared, stream, given, binned, grid, how)
