@@ -98,7 +98,7 @@ class SharedMultigridLevel(MultigridLevel):
             "volumes": self.volumes,
             "step": sampled(geometry, self.grid),
         }
-        target = self.shared.volume_parts(self.grid, self.volumes)
+        target = self.shared.like(volume.parts)
         task = ReconstructSlab(left.measured, geometry, target, options, onto=volume.parts)
         return self._by_slab(task, "correcting", title)
 
