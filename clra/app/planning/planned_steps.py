@@ -235,7 +235,7 @@ def _ordered_subsets(
     seen, rows = _seen_by_slabs(geometry, grid, tasks)
     pixels = float(geometry.rows * geometry.columns)
     volume, images = _bytes(grid), 4.0 * pixels * geometry.views
-    seen_images = 4.0 * pixels * seen
+    seen_rows = 4.0 * rows * geometry.columns
     updates = math.prod(grid.shape) * views_a_voxel(geometry, grid)
     read = images / 4 * _READ_S * workers.slowdown
     forward, adjoint = updates * speed.forward, _ADJOINT * updates * speed.forward
@@ -243,9 +243,9 @@ def _ordered_subsets(
     back += pixels * seen * _READ_S * workers.slowdown
     chunks = len(view_chunks(workers.count, geometry.views))
     steps = [
-        PlannedStep("reconstructing", tasks, back, seen_images, volume),
+        PlannedStep("reconstructing", tasks, back, 4.0 * pixels * seen, volume),
         PlannedStep("weighing", chunks, forward + read, images, images),
-        PlannedStep("back-projecting", tasks, adjoint, seen_images, volume),
+        PlannedStep("back-projecting", tasks, adjoint, seen_rows, volume),
     ]
     for subset in options.passes * subsets:
         part, chunks = len(subset) / geometry.views, len(view_chunks(workers.count, len(subset), 1))
@@ -258,7 +258,7 @@ def _ordered_subsets(
                 part * images + fetched,
                 part * images,
             ),
-            PlannedStep("stepping", tasks, part * adjoint, part * seen_images + 2 * volume, volume),
+            PlannedStep("stepping", tasks, part * adjoint, part * seen_rows + 2 * volume, volume),
         ]
     return steps
 

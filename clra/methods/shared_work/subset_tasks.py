@@ -14,7 +14,7 @@ from clra.methods.reconstruction.osem_tr import OrderedSubsets, ray_sums
 from clra.methods.shared_work.tasks import Measured
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.view_selection import runs, views_that_see
+from clra.model.view_selection import rows_that_see, runs, views_that_see
 from clra.ops.statistics.poisson import RayStatistics
 from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import add_to_slab
@@ -239,19 +239,28 @@ def back_projected(
     parts: VolumeParts,
     index: int,
 ) -> Array:
-    """Return the adjoint of images, (ny, nx, planes) of slab `index` of a volume's parts."""
+    """Return the adjoint of images, (ny, nx, planes) of slab `index` of a volume's parts.
+
+    Only rows that see the slab are read.
+    """
     grid = parts.grid.slab(*_ends(parts.planes[index]))
     total = constant_volume(stream, grid)
     assert len(total.planes) == 1  # slabs are cut to what the smallest device takes
     adjoint = SlabAdjoint(stream, total, geometry)
+    # Rays beside the outermost voxels count for them, up to the next ones.
+    nz, ny, nx = (count + 2 for count in grid.shape)
+    wider = VolumeGrid(shape=(nz, ny, nx), voxel_size=grid.voxel_size, centre=grid.centre)
+    rows = rows_that_see(geometry, wider)
     view_bytes = 4 * images.shape[1] * images.shape[2]
     for run in runs(views_that_see(geometry, grid)):
         for chunk in stream.chunks(run.stop - run.start, view_bytes):
             start, stop = run.start + chunk.start, run.start + chunk.stop
             stream.report("back-projecting", start, geometry.views)
+            seen = slice(int(rows[start:stop, 0].min()), int(rows[start:stop, 1].max()))
             # A CPU reads them in place.
-            read = images.read(start, stop)
-            adjoint(total, stream.upload(read), slice(start, stop))
+            host = np.zeros((stop - start, *images.shape[1:]), np.float32)
+            host[:, seen] = images.read(start, stop, seen)
+            adjoint(total, stream.upload(host), slice(start, stop))
             stream.queue.finish()
     return total.get(0)
 

@@ -12,10 +12,13 @@ from clra.methods.execution.several_devices import SeveralDevices
 from clra.methods.reconstruction.osem_tr import osem_tr, start_volume
 from clra.methods.shared_work.shared_ordered_subsets import shared_osem_tr, shared_start_volume
 from clra.methods.shared_work.shared_scan import SharedScan
+from clra.methods.shared_work.subset_tasks import back_projected
 from clra.model.grid import default_grid
 from clra.ops.runtime.devices import choose_device
+from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.radiographs import Radiographs
-from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.slab_projector import SlabAdjoint, constant_volume
+from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import HostPlanes
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -121,3 +124,29 @@ def test_a_coarse_level_in_little_memory(scan, tmp_path):
     assert_same(target.volume, volume.to_host())
     del parts
     assert [path.name.split("-")[0] for path in executor._files.iterdir()] == ["radiographs"]
+
+
+def test_a_slab_is_back_projected_from_the_rows_that_see_it(scan, tmp_path, monkeypatch):
+    stream, geometry = Stream(), scan.geometry
+    images = np.random.default_rng(6).normal(size=scan.shape).astype(np.float32)
+    parts = RadiographParts(tmp_path, scan.shape, (slice(0, scan.views),))
+    parts.write(slice(0, scan.views), images)
+    grid = default_grid(geometry)
+    slabs = VolumeParts(tmp_path, grid, tuple(equal_runs(grid.shape[0], 9)))
+    whole = constant_volume(stream, grid)
+    SlabAdjoint(stream, whole, geometry)(whole, stream.upload(images), slice(0, scan.views))
+    expected = stream.download(whole.get(0))
+    pixels, read = [], RadiographParts.read
+
+    def counted(self, start, stop, rows=None):
+        found = read(self, start, stop, rows)
+        pixels.append(found.size)
+        return found
+
+    monkeypatch.setattr(RadiographParts, "read", counted)
+    monkeypatch.setattr(stream, "chunks", lambda views, size: equal_runs(views, -(-views // 8)))
+    for index, planes in enumerate(slabs.planes):
+        found = stream.download(back_projected(stream, parts, geometry, slabs, index))
+        apart = np.abs(found - expected[:, :, planes]).max()
+        assert apart < 6e-6 * np.abs(expected).max()
+    assert sum(pixels) < 0.5 * 9 * images.size
