@@ -12,7 +12,7 @@ from clra.errors import Cancelled
 pytestmark = pytest.mark.usefixtures("own_folder")
 
 # Relative norm of volumes, with the motion known and with that found [pixel].
-VOLUME, ALIGNED, MOTION = 1e-6, 3e-6, 2e-5
+VOLUME, ALIGNED, MOTION = 1.5e-6, 3e-6, 2e-5
 
 
 @pytest.fixture(scope="module")
