@@ -28,6 +28,8 @@ def executing(
     checkpoint: Checkpoint | None,
     progress: ProgressCallback | None,
     limits: dict[str, Any],
+    *,
+    beside: Path | None = None,
 ) -> Iterator[InProcess | WorkerGroup]:
     """Yield a cluster if there is one, else several devices, else this process on its device.
 
@@ -40,15 +42,17 @@ def executing(
     checkpoint : Checkpoint, optional
         Of the call: files of the work go beside it; else a cluster's into the current folder, and
         those of several devices to where temporary files are.
+    beside : Path, optional
+        Folder for files of the work, in place of these.
     cluster, progress, limits
         As for :func:`clra.methods.execution.clusters.on_cluster`; None is no cluster.
     """
     if cluster is not None:
-        folder = _folder(checkpoint, Path.cwd())
+        folder = _folder(checkpoint, beside or Path.cwd())
         with on_cluster(cluster, folder, progress, limits) as workers:
             yield workers
     elif len(devices) > 1:
-        folder = _folder(checkpoint, Path(tempfile.gettempdir()))
+        folder = _folder(checkpoint, beside or Path(tempfile.gettempdir()))
         with closing(SeveralDevices(devices, folder, progress=progress, **limits)) as several:
             yield several
     else:

@@ -10,18 +10,27 @@ from numpy.typing import NDArray
 from clra.methods.execution.executor import (
     PARTS,
     Held,
+    Task,
     WorkerGroup,
     reconstruct_planes,
     slabs_of,
 )
 from clra.methods.reconstruction.fitted_fbp import VOLUMES, WINDOW
-from clra.methods.shared_work.tasks import Bin, HandOn, Measured, ReconstructSlab, Simulate
+from clra.methods.shared_work.tasks import (
+    Bin,
+    HandOn,
+    Measured,
+    NumbersOf,
+    ReconstructSlab,
+    Simulate,
+    Tabulate,
+)
 from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.scan import Scan
-from clra.ops.streaming.part_files import RadiographParts, VolumeParts
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
+from clra.ops.streaming.radiographs import PerView, Radiographs
 from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import PlaneSource, PlaneWriter
 
@@ -36,9 +45,12 @@ class SharedRadiographs(Radiographs):
     ----------
     measured : Measured
         What tasks know them by.
+    shared : SharedScan or None
+        Who reads them all, where numbers of each are asked for; None for the caller.
     """
 
     measured: Measured
+    shared: "SharedScan | None" = None
 
     @classmethod
     def in_files(cls, parts: RadiographParts, level: int) -> "SharedRadiographs":
@@ -46,6 +58,12 @@ class SharedRadiographs(Radiographs):
         radiographs = cls.of(parts, level)
         radiographs.measured = Measured(level, parts)
         return radiographs
+
+    def tabulated(self, stream: Stream, numbers: PerView, stage: str) -> NDArray[np.float64]:
+        """Return numbers of each view, as tasks find them."""
+        if self.shared is None:
+            return super().tabulated(stream, numbers, stage)
+        return self.shared.table(NumbersOf(self.measured, numbers), stage)
 
 
 class SharedScan:
@@ -84,12 +102,14 @@ class SharedScan:
         if factor == 1:
             radiographs = SharedRadiographs(stream, self.scan, 1)
             radiographs.measured = Measured(1, self.held)
-            return radiographs
-        target = self.radiograph_parts("radiographs", factor)
-        task = Bin(self.held, target, factor)
-        stage = f"reading radiographs, binned {factor} x {factor}"
-        self.workers.map(task, target.parts, stage=stage)
-        return SharedRadiographs.in_files(target, factor)
+        else:
+            target = self.radiograph_parts("radiographs", factor)
+            task = Bin(self.held, target, factor)
+            stage = f"reading radiographs, binned {factor} x {factor}"
+            self.workers.map(task, target.parts, stage=stage)
+            radiographs = SharedRadiographs.in_files(target, factor)
+        radiographs.shared = self
+        return radiographs
 
     def fitted(
         self,
@@ -148,6 +168,15 @@ class SharedScan:
     def source(self, volume: VolumeParts) -> "SharedVolume":
         """Return a volume in files as one that can be handed on."""
         return SharedVolume(self.workers, volume)
+
+    def table(self, work: Task[slice, NDArray[np.float64]], stage: str) -> NDArray[np.float64]:
+        """Do a task that returns rows (n, ...) for n views; return the rows of all views."""
+        target = TableParts(self.workers.new_folder("table"))
+        try:
+            self.workers.map(Tabulate(work, target), self.chunks, stage=stage)
+            return target.read(self.chunks)
+        finally:
+            shutil.rmtree(target.folder, ignore_errors=True)
 
     @property
     def chunks(self) -> tuple[slice, ...]:

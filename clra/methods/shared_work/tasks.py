@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.execution.executor import Held
+from clra.methods.execution.executor import Held, Task
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.methods.reconstruction.fitted_fbp import reprojections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.scan import Scan
-from clra.ops.streaming.part_files import RadiographParts, VolumeParts
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
+from clra.ops.streaming.radiographs import PerView, Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import PlaneWriter, Volume
 
@@ -59,6 +59,43 @@ class Bin:
         scan: Scan = self.scan.get()
         binned = Radiographs(stream, scan.subset(views), self.level)
         self.target.write(views, binned.read(slice(0, views.stop - views.start)))
+
+
+@dataclass(frozen=True)
+class Tabulate:
+    """Leaves numbers of some views in a file: more than a scheduler should have to pass on.
+
+    Parameters
+    ----------
+    work : callable
+        Task that returns rows (n, ...) for n views.
+    target : TableParts
+        Takes them.
+    """
+
+    work: Task[slice, NDArray[np.float64]]
+    target: TableParts
+
+    def __call__(self, stream: Stream, views: slice) -> None:
+        """Do the work for views."""
+        self.target.write(views, self.work(stream, views))
+
+
+@dataclass(frozen=True)
+class NumbersOf:
+    """Returns numbers of some radiographs."""
+
+    measured: Measured
+    numbers: PerView
+
+    def __call__(self, stream: Stream, views: slice) -> NDArray[np.float64]:
+        """Return rows (n, ...) for views."""
+        radiographs = self.measured.some(stream, views)
+
+        def numbers(images: NDArray[np.float32], part: slice) -> NDArray[np.float64]:
+            return self.numbers(images, slice(views.start + part.start, views.start + part.stop))
+
+        return radiographs.tabulated(stream, numbers, "reading")
 
 
 @dataclass(frozen=True)

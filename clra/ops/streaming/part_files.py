@@ -1,4 +1,4 @@
-"""Radiographs and volumes in files that several processes share, each file written by one.
+"""Radiographs, tables and volumes in files that several processes share, each file written by one.
 
 A file appears whole or not at all. It is written under a name of its own and renamed, so that work
 that is done twice, because one worker seemed lost, writes the same file twice and does no harm.
@@ -8,7 +8,7 @@ import math
 import os
 import uuid
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,7 +26,7 @@ from clra.ops.streaming.volume import PlaneWriter, Volume
 
 Floats = NDArray[np.float32]
 
-# Bytes that are on the host at a time when planes are handed on.
+# Bytes that are on the host at a time when planes or radiographs are handed on.
 _PIECE_BYTES = 32 << 20
 
 
@@ -90,6 +90,13 @@ class RadiographParts:
                     _read_into(file, out[views.start - start : views.stop - start])
         return out
 
+    def hand_on(self, views: slice, take: Callable[[int, Floats], None]) -> None:
+        """Give one of the parts to what takes all radiographs, some at a time; remove the file."""
+        step = max(1, _PIECE_BYTES // (4 * self.shape[1] * self.shape[2]))
+        for start, stop in pairwise([*range(views.start, views.stop, step), views.stop]):
+            take(start, self.read(start, stop))
+        self._path(views).unlink()
+
     def some(self, views: slice) -> "SomeParts":
         """Return consecutive views as radiographs of their own."""
         return SomeParts(self, views)
@@ -113,6 +120,31 @@ class SomeParts:
     def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
         """Return the views `start` to `stop - 1` of these, or rows of them."""
         return self.whole.read(self.views.start + start, self.views.start + stop, rows)
+
+
+@dataclass(frozen=True)
+class TableParts:
+    """Numbers of each view, (views, ...), those of some consecutive views in each file.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the files.
+    """
+
+    folder: Path
+
+    def write(self, views: slice, rows: NDArray[np.float64]) -> None:
+        """Write what is known of some views."""
+        with whole_file(self._path(views)) as file:
+            np.save(file, rows)
+
+    def read(self, parts: Iterable[slice]) -> NDArray[np.float64]:
+        """Return what is known of all views, given those of each file in order."""
+        return np.concatenate([np.load(self._path(views)) for views in parts])
+
+    def _path(self, views: slice) -> Path:
+        return self.folder / f"rows-{views.start:06}"
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Radiographs of one resolution, read in chunks."""
 
+from collections.abc import Callable
 from typing import Protocol, Self
 
 import numpy as np
@@ -13,6 +14,9 @@ from clra.ops.streaming.memory import Store, keeps
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float32]
+
+PerView = Callable[[Floats, slice], NDArray[np.float64]]
+"""Returns numbers (n, ...) of each of some radiographs (n, rows, columns), given which views."""
 
 
 class KeptRadiographs(Protocol):
@@ -103,6 +107,25 @@ class Radiographs:
             self._uploaded[part] = True
         array: Array = self._resident[views]
         return array
+
+    def tabulated(self, stream: Stream, numbers: PerView, stage: str) -> NDArray[np.float64]:
+        """Return numbers of each view, (views, ...); all radiographs are read.
+
+        Parameters
+        ----------
+        stream : Stream
+            Memory budget, and whom to tell how far it is.
+        numbers : callable
+            Gives them for some views. Picklable: others may do it.
+        stage : str
+            What progress reports call this.
+        """
+        rows, views = [], self.shape[0]
+        for chunk in stream.chunks(views, self.view_bytes):
+            stream.report(stage, chunk.start, views)
+            rows.append(numbers(self.read(chunk), chunk))
+        stream.report(stage, views, views)
+        return np.concatenate(rows)
 
     def __getitem__(self, views: slice) -> Floats:
         """Radiographs as the projections of a scan."""

@@ -1,8 +1,4 @@
-"""Workers of a cluster on this machine, and scans in files for them."""
-
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+"""A cluster of two workers, and scans in files that they read."""
 
 import numpy as np
 import pytest
@@ -11,10 +7,10 @@ import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
 
 
-@pytest.fixture(scope="session")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Connected to two workers."""
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
     distributed = pytest.importorskip("distributed")
+    folder = tmp_path_factory.mktemp("dask")
     with (
         distributed.LocalCluster(
             n_workers=2,
@@ -22,34 +18,38 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             memory_limit=None,
             dashboard_address=":0",
             silence_logs=50,
-            local_directory=str(tmp_path_factory.mktemp("dask")),
+            local_directory=str(folder),
         ) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):
         yield client
 
 
-@pytest.fixture
-def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave what is written to the current folder where the test can look at it."""
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture(scope="session")
-def scan_file(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int, int], clra.Scan]:
-    """Write and read a scan of spheres: kind of trajectory, views, columns."""
+def scan_file(path, kind, views, size=64):
+    geometry = paper_like(kind, views, (size, size))
+    random = np.random.default_rng(3)
+    truth = clra.Motion(
+        shift_u=random.normal(0, 1, views),
+        shift_v=random.normal(0, 1, views),
+        magnification=np.ones(views),
+    )
+    clra.write_scan(path, simulated_scan(geometry, sample("spheres", geometry), truth, name=kind))
+    return clra.read_scan(path)
 
-    def written(kind: str, views: int, size: int) -> clra.Scan:
-        geometry = paper_like(kind, views, (size, size))
-        random = np.random.default_rng(3)
-        truth = clra.Motion(
-            shift_u=random.normal(0, 1, views),
-            shift_v=random.normal(0, 1, views),
-            magnification=np.ones(views),
-        )
-        scan = simulated_scan(geometry, sample("spheres", geometry), truth, name=kind)
-        path = tmp_path_factory.mktemp("scans") / f"{kind}.nxs"
-        clra.write_scan(path, scan)
-        return clra.read_scan(path)
 
-    return written
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scans")
+    # As few views a turn as Katsevich's method takes.
+    views = {"helix": 320, "space-filling": 160}
+    return {kind: scan_file(folder / f"{kind}.nxs", kind, n) for kind, n in views.items()}
+
+
+@pytest.fixture(scope="module")
+def small_scan(tmp_path_factory):
+    return scan_file(tmp_path_factory.mktemp("scans") / "small.nxs", "helix", 96, size=40)

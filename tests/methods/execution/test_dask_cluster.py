@@ -23,16 +23,6 @@ VOLUME, VOXEL = 3e-6, 2e-4
 MOTION = 1e-4
 
 
-pytestmark = pytest.mark.usefixtures("own_folder")
-
-
-@pytest.fixture(scope="module")
-def scans(scan_file):
-    # As few views a turn as Katsevich's method takes.
-    views = {"helix": 320, "space-filling": 160}
-    return {kind: scan_file(kind, n, 64) for kind, n in views.items()}
-
-
 @pytest.fixture(scope="module")
 def alone(scans):
     return {
@@ -127,7 +117,6 @@ def test_radiographs_in_memory_are_refused(client, scans):
     ("call", "expected"),
     [
         (lambda scan, on: clra.align(scan, method="reference", cluster=on), "found 'reference'"),
-        (lambda scan, on: clra.align(scan, estimate="rigid", cluster=on), "found 'rigid'"),
         (lambda scan, on: clra.align(scan, cluster="node1"), "expected ADDRESS"),
         (lambda scan, on: clra.align(scan, cluster=3), "expected a distributed"),
     ],

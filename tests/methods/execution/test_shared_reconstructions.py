@@ -21,8 +21,6 @@ from clra.ops.streaming.slab_projector import SlabAdjoint, constant_volume
 from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import HostPlanes
 
-pytestmark = pytest.mark.usefixtures("own_folder")
-
 # Norm of the volume, and single voxels: images and slabs are summed in other portions.
 VOLUME, VOXEL = 1e-6, 1e-5
 SUBSETS = 3
@@ -33,8 +31,8 @@ def options(**given):
 
 
 @pytest.fixture(scope="module")
-def scan(scan_file):
-    return scan_file("helix", 96, 40)
+def scan(small_scan):
+    return small_scan
 
 
 @pytest.fixture(scope="module")
