@@ -53,3 +53,8 @@ def scans(tmp_path_factory):
 @pytest.fixture(scope="module")
 def small_scan(tmp_path_factory):
     return scan_file(tmp_path_factory.mktemp("scans") / "small.nxs", "helix", 96, size=40)
+
+
+@pytest.fixture(scope="module")
+def few_views(tmp_path_factory):
+    return scan_file(tmp_path_factory.mktemp("scans") / "few.nxs", "space-filling", 96)
