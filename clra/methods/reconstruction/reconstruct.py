@@ -261,7 +261,7 @@ def reconstruct_into(
                 keeping.resume = keeping.there if begun.resume else keeping.resume
             alignment = align_scan(
                 scan,
-                device=devices[0],
+                device=device,
                 progress=progress,
                 checkpoint=begun,
                 cluster=cluster,
