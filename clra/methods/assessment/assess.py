@@ -21,6 +21,7 @@ from clra.model.grid import default_grid
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered
 from clra.model.scan import Scan
+from clra.ops.streaming.radiographs import Reading
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,13 @@ _POINTS = 300
 
 
 def assess(
-    stream: Stream, scan: Scan, aligned: AlignmentResult, start: Motion, *, scale: bool
+    stream: Stream,
+    scan: Scan,
+    aligned: AlignmentResult,
+    start: Motion,
+    *,
+    scale: bool,
+    reading: Reading | None = None,
 ) -> AlignmentResult:
     """Judge an alignment by views that are held out.
 
@@ -51,6 +58,8 @@ def assess(
         Where it started.
     scale : bool
         Whether magnifications were estimated.
+    reading : callable, optional
+        Reads radiographs; this process by default.
 
     Returns
     -------
@@ -59,7 +68,7 @@ def assess(
         with the start as its motion if the one that was found predicts them no better.
     """
     region = region_of(stream, scan, default_grid(scan.geometry))
-    held_out = HeldOut(stream, scan, region.grid)
+    held_out = HeldOut(stream, scan, region.grid, reading)
     radiographs, views = held_out.radiographs(aligned.valid_views)
 
     def predicted(

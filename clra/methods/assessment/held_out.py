@@ -30,7 +30,7 @@ from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.subsets import ordered_subsets
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.radiographs import Radiographs, Reading, read_here
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
@@ -107,11 +107,14 @@ class HeldOut:
         At full resolution.
     grid : VolumeGrid
         At full resolution: of all that the radiographs show.
+    reading : callable, optional
+        Reads radiographs; this process by default.
     """
 
     stream: Stream
     scan: Scan
     grid: VolumeGrid
+    reading: Reading | None = None
 
     @property
     def level(self) -> int:
@@ -133,7 +136,8 @@ class HeldOut:
     def radiographs(self, valid_views: NDArray[np.bool_]) -> tuple[Radiographs, NDArray[np.intp]]:
         """Read and bin what is needed; the second value are the views that these are."""
         views = self.chosen(valid_views)
-        return Radiographs(self.stream, self.scan.subset(views), self.level, keep=True), views
+        reading = self.reading or read_here(self.stream)
+        return reading(self.scan.subset(views), self.level), views
 
     def predict(
         self,

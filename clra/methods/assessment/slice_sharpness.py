@@ -12,7 +12,7 @@ from clra.model.scan import Scan
 from clra.ops.filtering.ramp import RampFilter, taper
 from clra.ops.projection.projector import BackProjector
 from clra.ops.streaming.memory import DeviceMemoryError
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.radiographs import Reading, read_here
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,9 @@ _COLUMNS, _FADE, _INSIDE = 200, 0.1, 0.9
 _PLANES, _REACH = 7, 0.8
 
 
-def sharpening_by_opposite_rotation(stream: Stream, scan: Scan, motion: Motion) -> float:
+def sharpening_by_opposite_rotation(
+    stream: Stream, scan: Scan, motion: Motion, reading: Reading | None = None
+) -> float:
     """How much sharper slices would be if the sample turned the other way.
 
     Radiographs of a narrow beam fit a wrong sense nearly as well as the right one, by a mirrored
@@ -41,6 +43,8 @@ def sharpening_by_opposite_rotation(stream: Stream, scan: Scan, motion: Motion) 
         Any.
     motion : Motion
         Of its views, as far as known.
+    reading : callable, optional
+        Reads radiographs; this process by default.
 
     Returns
     -------
@@ -54,7 +58,7 @@ def sharpening_by_opposite_rotation(stream: Stream, scan: Scan, motion: Motion) 
     scan, motion = scan.subset(chosen), motion.subset(chosen)
     ours, other = (g.with_motion(motion) for g in (scan.geometry, opposite_rotation(scan.geometry)))
     try:
-        slices = Slices(stream, scan, ours)
+        slices = Slices(stream, scan, ours, reading=reading)
         slices.sharpnesses(ours)
         return float(np.median(slices.sharpnesses(other)))
     except DeviceMemoryError:
@@ -71,11 +75,12 @@ class Slices:
         geometry: ConeBeamGeometry,
         columns: int = _COLUMNS,
         inside: float = _INSIDE,
+        reading: Reading | None = None,
     ) -> None:
         self.stream, self._geometry = stream, geometry
         # Pixels of the full detector in one of these radiographs.
         self.pixel = next((n for n in (1, 2, 4) if geometry.columns // n <= columns), 8)
-        radiographs = Radiographs(stream, scan, self.pixel)
+        radiographs = (reading or read_here(stream))(scan, self.pixel)
         binned = geometry.binned(self.pixel)
         self._filtered = stream.empty(radiographs.shape)
         ramp = RampFilter(

@@ -153,7 +153,8 @@ def run(path: str, item: Any, settings: Settings) -> Outcome:
                 result = task(_stream(settings), item)
             except Exception as error:
                 trace = traceback.format_exc()
-                _LOG.warning("%s: %s", path, trace)
+                if Path(path).parent.exists():  # else the call is over
+                    _LOG.warning("%s: %s", path, trace)
                 return Outcome(*me, error=_portable(error), trace=trace)
         return Outcome(*me, result, tuple(findings))
 

@@ -22,6 +22,7 @@ from clra.methods.reconstruction.katsevich import Exact, exact_helices
 from clra.methods.reconstruction.missing_views import without_gaps
 from clra.methods.reconstruction.scan_checks import warn_of_method, warn_of_scan
 from clra.methods.reconstruction.some_planes import SomePlanes
+from clra.methods.shared_work.shared_scan import reading_by
 from clra.model.binning import binned_motion, binned_scan
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import Region, VolumeGrid, volume_grid
@@ -271,13 +272,13 @@ def reconstruct_into(
             motion = binned_motion(motion, binning, scan.geometry.shape)
         scan = small
         warn_of_method(stream, scan, method)
-        if alignment is None and not align:
-            warn_of_scan(stream, scan, motion)
         if fitted is not None:
             there = scan.views if valid_views is None else int(valid_views.sum())
             _warn_of_gaps(fitted, grid, there)
         steps: tuple[ImgrStep, ...] = ()
         with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+            if alignment is None and not align:
+                warn_of_scan(stream, scan, motion, reading_by(executor, stream))
             if options is not None:
                 request = iterative.Request(scan, grid, motion, align, valid_views, options)
                 steps, found = iterative.iterate(executor, stream, target, request, keeping)

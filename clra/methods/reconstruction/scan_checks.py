@@ -16,7 +16,7 @@ from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered, is_circle, part_of_a_turn
 from clra.model.sampling.field_of_view import is_offset
 from clra.model.scan import Scan
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.radiographs import Radiographs, Reading
 from clra.ops.streaming.stream import Stream
 
 # Most columns that the axis is looked for in.
@@ -54,7 +54,7 @@ def warn_of_method(stream: Stream, scan: Scan, method: str) -> None:
             Finding(code, note).warn()
 
 
-def warn_of_scan(stream: Stream, scan: Scan, motion: Motion | None) -> None:
+def warn_of_scan(stream: Stream, scan: Scan, motion: Motion | None, reading: Reading) -> None:
     """Warn of what an alignment would have told of a scan: defects, rotation sense, axis.
 
     Parameters
@@ -65,24 +65,28 @@ def warn_of_scan(stream: Stream, scan: Scan, motion: Motion | None) -> None:
         Some of its radiographs are read.
     motion : Motion, optional
         Of its views, as far as known.
+    reading : callable
+        Reads those that are looked at binned.
     """
     told = [f for f in radiograph_findings(scan) if f.code not in _KNOWN]
     with suppress(InputError):  # of few rows or a detector that lies flat there is nothing to tell
-        told += _geometry_findings(stream, scan, motion or Motion.identity(scan.views))
+        told += _geometry_findings(stream, scan, motion or Motion.identity(scan.views), reading)
     for finding in told:
         finding.warn()
 
 
-def _geometry_findings(stream: Stream, scan: Scan, motion: Motion) -> list[Finding]:
+def _geometry_findings(
+    stream: Stream, scan: Scan, motion: Motion, reading: Reading
+) -> list[Finding]:
     """Look for the axis elsewhere, or the sample turning the other way."""
-    found = _axis_elsewhere(stream, scan, motion)
+    found = _axis_elsewhere(stream, scan, motion, reading)
     if found is None:  # slices with the axis elsewhere may well be sharper the other way round
-        sharper = sharpening_by_opposite_rotation(stream, scan, motion)
+        sharper = sharpening_by_opposite_rotation(stream, scan, motion, reading)
         found = doubted_rotation(sharper, _SHARPER) if sharper == sharper else None
     return [] if found is None else [found]
 
 
-def _axis_elsewhere(stream: Stream, scan: Scan, motion: Motion) -> Finding | None:
+def _axis_elsewhere(stream: Stream, scan: Scan, motion: Motion, reading: Reading) -> Finding | None:
     """Look for another column of the axis, where rays are measured twice."""
     ideal = scan.geometry
     if not is_circle(ideal) or covered(ideal) < np.pi or is_offset(ideal) or steep_rows(ideal):
@@ -91,7 +95,7 @@ def _axis_elsewhere(stream: Stream, scan: Scan, motion: Motion) -> Finding | Non
     part = scan.subset(chosen)
     geometry = part.geometry.with_motion(motion.subset(chosen))
     pixel = next((n for n in (1, 2, 4) if scan.geometry.columns // n <= _COLUMNS), 8)
-    binned = Scan(Radiographs(stream, part, pixel), geometry.binned(pixel))
+    binned = Scan(reading(part, pixel), geometry.binned(pixel))
     try:
         offset, gain = axis_offset(stream, binned)
     except InputError:

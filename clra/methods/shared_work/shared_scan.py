@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clra.methods.execution.executor import (
     PARTS,
     Held,
+    InProcess,
     Task,
     WorkerGroup,
     reconstruct_planes,
@@ -32,7 +33,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
-from clra.ops.streaming.radiographs import PerView, Radiographs
+from clra.ops.streaming.radiographs import PerView, Radiographs, Reading, read_here
 from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import PlaneSource, PlaneWriter
 
@@ -91,7 +92,7 @@ class SharedScan:
         self.scan = scan
         self.held: Held = workers.share(scan)
 
-    def binned(self, stream: Stream, factor: int) -> SharedRadiographs:
+    def binned(self, stream: Stream, factor: int, *, keep: bool = False) -> SharedRadiographs:
         """Return the scan's radiographs, binned.
 
         Parameters
@@ -100,8 +101,10 @@ class SharedScan:
             Of the caller, who reads a few of them.
         factor : int
             Binning factor.
+        keep : bool
+            Whether they are read once even if they are not binned.
         """
-        if factor == 1:
+        if factor == 1 and not keep:
             radiographs = SharedRadiographs(stream, self.scan, 1)
             radiographs.measured = Measured(1, self.held)
         else:
@@ -244,6 +247,21 @@ class SharedVolume(PlaneSource):
         reconstruct_planes(
             self._workers, task, shape, target, stage="writing the volume", part=None
         )
+
+
+def reading_by(executor: InProcess | WorkerGroup, stream: Stream) -> Reading:
+    """Return what reads radiographs: this process, or several workers.
+
+    Parameters
+    ----------
+    executor : InProcess or WorkerGroup
+        Who does the work.
+    stream : Stream
+        Of this process.
+    """
+    if isinstance(executor, InProcess):
+        return read_here(stream)
+    return lambda scan, level: SharedScan(executor, scan).binned(stream, level, keep=True)
 
 
 def chunks_each(places: int, geometry: ConeBeamGeometry) -> int:

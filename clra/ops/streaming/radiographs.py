@@ -154,3 +154,22 @@ class Radiographs:
             kept.write(views.start, stream.download(images))
         stream.report(name, self.shape[0], self.shape[0])
         return kept
+
+
+Reading = Callable[[Scan, int], Radiographs]
+"""Reads all radiographs of a scan once, binned by a factor; others may do it."""
+
+
+def read_here(stream: Stream) -> Reading:
+    """Return what reads radiographs in this process.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device that bins.
+    """
+
+    def reading(scan: Scan, level: int) -> Radiographs:
+        return Radiographs(stream, scan, level, keep=True)
+
+    return reading
