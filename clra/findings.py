@@ -58,7 +58,7 @@ class Finding:
 
         Mere information is logged instead. Either goes to :func:`collected`.
         """
-        if self.severity == "info":
+        if self.severity == "info" or _SILENT.get():
             return self.record()
         self._collect()
         warnings.warn(str(self), ClraWarning, stacklevel=_callers_level())
@@ -82,14 +82,22 @@ def warn(code: str, message: str, advice: str = "") -> None:
 
 
 @contextmanager
-def collected() -> Iterator[list[Finding]]:
-    """Yield a list to which every finding that is issued within the block is appended, once."""
+def collected(*, silent: bool = False) -> Iterator[list[Finding]]:
+    """Yield a list to which every finding that is issued within the block is appended, once.
+
+    Parameters
+    ----------
+    silent : bool
+        Issue no warnings: whoever asked for the work, elsewhere, issues the findings again.
+    """
     findings: list[Finding] = []
     token = _COLLECTING.set((*_COLLECTING.get(), findings))
+    before = _SILENT.set(silent or _SILENT.get())
     try:
         yield findings
     finally:
         _COLLECTING.reset(token)
+        _SILENT.reset(before)
 
 
 def collected_so_far(*, outermost: bool = False) -> tuple[Finding, ...]:
@@ -100,6 +108,7 @@ def collected_so_far(*, outermost: bool = False) -> tuple[Finding, ...]:
 
 _LOG = logging.getLogger(__name__)
 _COLLECTING: ContextVar[tuple[list[Finding], ...]] = ContextVar("collecting", default=())
+_SILENT: ContextVar[bool] = ContextVar("silent", default=False)
 _PACKAGE = str(Path(__file__).parent)
 
 

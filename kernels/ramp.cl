@@ -5,8 +5,9 @@
 // the ray over the distance from source to detector. Past the detector a line runs out from its
 // outermost values, the last going right and, cyclically, the first going left, each times `roll`.
 //
-// Lines are numbered through all views: line = view * rows + row. A work-item makes LANES columns
-// of one line. Global sizes are (blocks of LANES columns, lines), rounded up at will.
+// Of each view the same `rows` rows are filtered, from row `top` of the detector on. Lines are
+// numbered through all views: line = view * rows + row - top. A work-item makes LANES columns of one
+// line. Global sizes are (blocks of LANES columns, lines), rounded up at will.
 
 #include "ramp.clh"
 #include "vectors.clh"
@@ -25,7 +26,7 @@ kernel required_group void weight_lines(
     const ulong projections_offset,
     global const float *restrict view_table, // (views, VIEW_FIELDS)
     const ulong view_table_offset, // of the projections' first view
-    global const float *restrict row_weight, // (rows,)
+    global const float *restrict row_weight, // of all rows of the detector
     const ulong row_weight_offset,
     global const float *restrict ray_weight, // (views, columns) of the projections, or (columns,)
     const ulong ray_weight_offset,
@@ -34,6 +35,7 @@ kernel required_group void weight_lines(
     const int first, // line of the projections that becomes line 0
     const int count,
     const int rows,
+    const int top,
     const int columns,
     const int padded, // >= 2 columns
     const int ray_stride) // columns, or 0 if all views have the same ray weights
@@ -48,7 +50,7 @@ kernel required_group void weight_lines(
     if (i >= padded || line >= count)
         return;
     const int source = first + line;
-    const LineWeight w = line_weight(view_table, row_weight, source, rows);
+    const LineWeight w = line_weight(view_table, row_weight, source / rows, top + source % rows);
     global const float *p = projections + (ulong)source * columns;
     lines += (ulong)line * padded + i;
     ray_weight += (ulong)(source / rows) * ray_stride;
@@ -75,12 +77,15 @@ kernel required_group void weight_lines(
 }
 
 kernel required_group void cut_lines(
-    global float *restrict filtered, // (views, rows, columns), of a detector that may be wider
+    global float *restrict filtered, // (views, height, columns), of a detector that may be wider
     const ulong filtered_offset,
     global const float *restrict lines, // (count, padded)
     const ulong lines_offset,
-    const int first, // line of `filtered` that line 0 becomes
+    const int first, // line of the projections that line 0 is
     const int count,
+    const int rows,
+    const int top,
+    const int height, // rows of `filtered`
     const int columns, // of `filtered`
     const int padded,
     const int before) // columns of `filtered` left of the detector, at the lines' ends
@@ -90,7 +95,8 @@ kernel required_group void cut_lines(
     const int i = get_global_id(0) * LANES, line = get_global_id(1);
     if (i >= columns || line >= count)
         return;
-    filtered += (ulong)(first + line) * columns + i;
+    const int source = first + line;
+    filtered += ((ulong)(source / rows) * height + top + source % rows) * columns + i;
     lines += (ulong)line * padded;
     const int from = i < before ? i - before + padded : i - before;
     if (i + LANES <= columns && from + LANES <= padded) {

@@ -8,8 +8,8 @@
 // `ramp` has that order, and the way back undoes it. Twiddles come from a table: native functions
 // are not exact enough.
 //
-// Work-group (GROUP, 1, 1) for each pair of rows of a view; global size GROUP times their number,
-// views ceil(rows / 2).
+// Work-group (GROUP, 1, 1) for each pair of rows of a view, of `rows` from row `top` of the detector
+// on; global size GROUP times their number, views ceil(rows / 2).
 
 #include "ramp.clh"
 
@@ -86,13 +86,13 @@ static inline void pairs(local float2 *line, const int item)
 }
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
-    global float *filtered, // (views, rows, wider), may be the projections if that is no wider
+    global float *filtered, // (views, height, wider), may be the projections if that is no larger
     const ulong filtered_offset,
     global const float *projections, // (views, rows, columns), line integrals
     const ulong projections_offset,
     global const float *restrict view_table, // (views, VIEW_FIELDS)
     const ulong view_table_offset, // of the projections' first view
-    global const float *restrict row_weight, // (rows,)
+    global const float *restrict row_weight, // (height,)
     const ulong row_weight_offset,
     global const float *restrict ray_weight, // (views, columns) of the projections, or (columns,)
     const ulong ray_weight_offset,
@@ -102,7 +102,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     const ulong ramp_offset,
     global const float2 *restrict twiddles, // (LENGTH,): exp(-2 pi i k / LENGTH)
     const ulong twiddles_offset,
-    const int rows, // of a view
+    const int rows, // of a view of the projections
+    const int top,
+    const int height,
     const int columns,
     const int ray_stride, // columns, or 0 if all views have the same ray weights
     const int wider, // columns of `filtered`
@@ -117,15 +119,15 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     ramp += ramp_offset;
     twiddles += twiddles_offset;
     const int item = get_local_id(0), pairs_of_view = (rows + 1) / 2;
-    const int view = (int)get_group_id(0) / pairs_of_view, top = view * rows;
+    const int view = (int)get_group_id(0) / pairs_of_view;
     ray_weight += ray_weight_offset + (ulong)view * ray_stride;
-    const int first = top + 2 * ((int)get_group_id(0) % pairs_of_view), second = first + 1;
-    const int both = second < top + rows;
-    const int other = both ? second : first; // the last row of an odd number is taken twice
-    const LineWeight one = line_weight(view_table, row_weight, first, rows);
-    const LineWeight two = line_weight(view_table, row_weight, other, rows);
-    global const float *p = projections + (ulong)first * columns;
-    global const float *q = projections + (ulong)other * columns;
+    const int first = 2 * ((int)get_group_id(0) % pairs_of_view), both = first + 1 < rows;
+    const int other = first + both; // the last row of an odd number is taken twice
+    const LineWeight one = line_weight(view_table, row_weight, view, top + first);
+    const LineWeight two = line_weight(view_table, row_weight, view, top + other);
+    global const float *p = projections + ((ulong)view * rows + first) * columns;
+    global const float *q = p + both * columns;
+    filtered += ((ulong)view * height + top + first) * wider;
     for (int i = item; i < LENGTH; i += GROUP) {
         const int from = source_column(i, columns, LENGTH);
         const float part = ray_weight[from] * (i < columns ? 1.0f : roll[i - columns]);
@@ -156,8 +158,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void filter_pairs(
     for (int i = item; i < wider; i += GROUP) {
         const int from = i < before ? i - before + LENGTH : i - before;
         const float2 value = line[PLACE(from)];
-        filtered[(ulong)first * wider + i] = value.x;
+        filtered[i] = value.x;
         if (both)
-            filtered[(ulong)second * wider + i] = value.y;
+            filtered[wider + i] = value.y;
     }
 }

@@ -44,8 +44,8 @@ class Console:
         str | None,
         typer.Option(
             metavar="NAME",
-            help="OpenCL device: part of its name, or its index (see clra devices); reconstruct "
-            "takes all as well.",
+            help="OpenCL device: part of its name, or its index (see clra devices); align, "
+            "reconstruct and correct take all as well.",
         ),
     ] = None
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False

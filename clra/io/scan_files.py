@@ -21,7 +21,7 @@ from clra.io.scanners.recognise import read_scanner
 from clra.io.scanners.scanner_options import ScannerOptions
 from clra.io.scanners.scanner_scan import ScannerScan
 from clra.model.detector_pose import flipped, with_axis_at
-from clra.model.scan import Scan
+from clra.model.scan import DeliveredProjections, Scan
 from clra.model.validation import all_but
 from clra.progress import ProgressCallback
 
@@ -168,7 +168,7 @@ def write_scan(
     path : path-like
         The file.
     scan : Scan
-        Read some views at a time.
+        Read some views at a time; or corrected by others, see :func:`clra.correct`.
     valid_views : ndarray of bool, (views,), optional
         Views to be used, at least one, all by default. The others are written as well, marked
         invalid: readers of NXtomo, :func:`read_scan` too, leave them out.
@@ -184,9 +184,10 @@ def write_scan(
     OutputError
         If the file cannot be written.
     """
+    made = scan.projections
     write_nxtomo(
         path,
-        _LineIntegrals(scan),
+        made if isinstance(made, DeliveredProjections) else _LineIntegrals(scan),
         scan.geometry,
         kind="line-integrals",
         dtype=np.float32,

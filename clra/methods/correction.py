@@ -1,5 +1,9 @@
 """Radiographs as they would have been without motion, for export and for ideal-row methods."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,10 +12,18 @@ from numpy.typing import NDArray
 from clra.errors import InputError
 from clra.findings import Finding
 from clra.methods.alignment.result import AlignmentResult
+from clra.methods.execution.choice import check_for_cluster, executing
+from clra.methods.execution.executor import PARTS, Held, InProcess, WorkerGroup
 from clra.model.motion import Motion
-from clra.model.scan import Scan
+from clra.model.scan import Projections, Scan
 from clra.ops.images.warp import Warp
-from clra.ops.streaming.stream import Stream
+from clra.ops.runtime.devices import usable_devices
+from clra.ops.streaming.part_files import RadiographParts
+from clra.ops.streaming.stream import Stream, equal_runs
+from clra.progress import ProgressCallback
+
+# Bytes of corrected radiographs in a file, which a worker has in memory.
+_FILE_BYTES = 256 << 20
 
 
 def correct(
@@ -21,6 +33,7 @@ def correct(
     *,
     max_device_memory: int | None = None,
     max_host_memory: int | None = None,
+    cluster: Any = None,
 ) -> Scan:
     """Undo the motion of each radiograph by resampling it.
 
@@ -35,9 +48,12 @@ def correct(
         Of its views, as :func:`clra.align` found it. Views that an alignment rejected are left out;
         of a motion alone, no view is.
     device : str or cl.Device, optional
-        As :func:`clra.ops.runtime.devices.choose_device` takes it.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all".
     max_device_memory, max_host_memory : int, optional
         Bytes that may be used.
+    cluster : distributed.Client or str, optional
+        Workers, as :func:`clra.align` takes them. They, or all devices, correct radiographs that
+        :func:`clra.write_scan` writes; single ones are corrected here.
 
     Returns
     -------
@@ -47,17 +63,46 @@ def correct(
     Raises
     ------
     InputError
-        If the motion is of another number of views.
+        If the motion is of another number of views, or as :func:`clra.align` for `cluster`.
     """
-    stream = Stream(device, max_device_memory=max_device_memory, max_host_memory=max_host_memory)
+    check_for_cluster(cluster, scan, "correct", ("correct",))
     if isinstance(motion, AlignmentResult):
-        whole = corrected(stream, scan, motion.motion)
-        return whole if motion.valid_views.all() else whole.subset(motion.valid_views)
-    return corrected(stream, scan, motion)
+        _check(scan, motion.motion)
+        if not motion.valid_views.all():
+            scan = scan.subset(motion.valid_views)
+        motion = motion.motion.subset(motion.valid_views)
+    limits: dict[str, Any] = {
+        "max_device_memory": max_device_memory,
+        "max_host_memory": max_host_memory,
+    }
+    devices = usable_devices(device)
+    stream = Stream(devices[0], **limits)
+    found = corrected(stream, scan, motion)
+    if cluster is None and len(devices) == 1:
+        return found
+
+    def workers(
+        folder: Path, progress: ProgressCallback | None
+    ) -> AbstractContextManager[InProcess | WorkerGroup]:
+        return executing(stream, devices, cluster, None, progress, limits, beside=folder)
+
+    return replace(found, projections=_CorrectedByWorkers(found.projections, scan, motion, workers))
 
 
 def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
     """Do as :func:`correct`, errors included, on the device and within the memory of a stream."""
+    _check(scan, motion)
+    if motion.cause == "source":
+        Finding(
+            "parallax",
+            "radiographs are resampled as if their detector had moved, but it was the source: they "
+            "are right for what lies at the depth of the axis, and what is nearer to the source or "
+            "farther keeps its parallax",
+        ).warn()
+    return _resampled(stream, scan, motion)
+
+
+def _check(scan: Scan, motion: Motion) -> None:
     if motion.views != scan.views:
         raise InputError(f"motion: found {motion.views} views, expected {scan.views}")
     if motion.cause == "sample":
@@ -66,13 +111,9 @@ def corrected(stream: Stream, scan: Scan, motion: Motion) -> Scan:
             "expected shifts; reconstruct with the alignment instead, or align with estimate "
             "'shift'"
         )
-    if motion.cause == "source":
-        Finding(
-            "parallax",
-            "radiographs are resampled as if their detector had moved, but it was the source: they "
-            "are right for what lies at the depth of the axis, and what is nearer to the source or "
-            "farther keeps its parallax",
-        ).warn()
+
+
+def _resampled(stream: Stream, scan: Scan, motion: Motion) -> Scan:
     return Scan(
         _Corrected(scan, motion, stream),
         scan.geometry,
@@ -110,3 +151,57 @@ class _Corrected:
             self._warp(stream.queue, corrected, measured, motion)
             out[chunk] = stream.download(corrected)
         return out
+
+
+@dataclass(frozen=True)
+class _CorrectedByWorkers:
+    """Corrected line integrals, some made here as they are read, all by several workers."""
+
+    here: Projections
+    scan: Scan
+    motion: Motion
+    workers: Callable[
+        [Path, ProgressCallback | None], AbstractContextManager[InProcess | WorkerGroup]
+    ]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.here.shape
+
+    def __getitem__(self, views: slice) -> Any:
+        return self.here[views]
+
+    def deliver(
+        self,
+        take: Callable[[int, NDArray[np.float32]], None],
+        folder: Path,
+        progress: ProgressCallback | None,
+    ) -> None:
+        scan = self.scan
+        with self.workers(folder, progress) as workers:
+            assert not isinstance(workers, InProcess)
+            most = max(1, _FILE_BYTES // (4 * scan.geometry.rows * scan.geometry.columns))
+            count = max(PARTS * workers.places, -(-scan.views // most))
+            parts = equal_runs(scan.views, min(scan.views, count))
+            made = RadiographParts(workers.new_folder("corrected"), scan.shape, tuple(parts))
+            task = _CorrectViews(workers.share(scan), self.motion, made)
+            workers.map(
+                task,
+                parts,
+                stage="correcting",
+                # Others are made while these are handed on.
+                done=lambda number: made.hand_on(parts[number], take),
+            )
+
+
+@dataclass(frozen=True)
+class _CorrectViews:
+    """Corrects some radiographs of a scan into a file."""
+
+    scan: Held
+    motion: Motion
+    target: RadiographParts
+
+    def __call__(self, stream: Stream, views: slice) -> None:
+        made = _resampled(stream, self.scan.get(), self.motion)
+        self.target.write(views, made.read(views.start, views.stop))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,7 @@ from clra.model.corrections.corrections import Corrections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.validation import selection
+from clra.progress import ProgressCallback
 
 KINDS = ("line-integrals", "transmission")
 
@@ -36,6 +39,33 @@ class Projections(Protocol):
 
     def __getitem__(self, views: slice, /) -> Any:
         """Return some consecutive views as an array."""
+        ...
+
+
+@runtime_checkable
+class DeliveredProjections(Projections, Protocol):
+    """Line integrals that others make, some views here and some there.
+
+    Whoever wants all of them has them delivered.
+    """
+
+    def deliver(
+        self,
+        take: Callable[[int, NDArray[np.float32]], None],
+        folder: Path,
+        progress: ProgressCallback | None,
+    ) -> None:
+        """Hand all radiographs on in any order, as :meth:`Scan.read` would give them.
+
+        Parameters
+        ----------
+        take : callable
+            Called with the first view and some radiographs (n, rows, columns), each once.
+        folder : Path
+            Where files may lie meanwhile.
+        progress : callable, optional
+            Called with a :class:`clra.progress.Progress` as work goes on.
+        """
         ...
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,6 +16,12 @@ from clra.model.grid import VolumeGrid
 from clra.model.validation import vectors
 
 Floats = NDArray[np.float64]
+
+# Corners of the outline of a cylinder: 2 % wider than it is.
+_CORNERS = 16
+# Part of the rows from which on all of them are read, and how much wider than its own rows those of
+# a view may become by those of its neighbours.
+_NEARLY_ALL, _WIDER = 0.75, 1.25
 
 
 def views_that_see(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.bool_]:
@@ -42,6 +49,77 @@ def views_that_see(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.b
     high = np.nanmax(pixels, axis=1, initial=-np.inf)
     size = np.array([geometry.columns, geometry.rows])
     return np.asarray(behind | ((high > -1) & (low < size)).all(axis=1))
+
+
+def rows_that_see(
+    geometry: ConeBeamGeometry, grid: VolumeGrid, radius: float = math.inf
+) -> NDArray[np.int_]:
+    """Return the rows of each view's detector that voxels of a grid are interpolated between.
+
+    Parameters
+    ----------
+    geometry : ConeBeamGeometry
+        Of the views.
+    grid : VolumeGrid
+        Volume or slab.
+    radius : float
+        About the z axis, beyond which voxels do not count [mm].
+
+    Returns
+    -------
+    ndarray of int, (views, 2)
+        First row, even, and one past the last; all rows where a voxel is behind the source.
+    """
+    x, y, z = grid.coordinates()
+    ends = [(axis[0], axis[-1]) for axis in (x, y)]
+    if max(math.hypot(a, b) for a in ends[0] for b in ends[1]) <= radius:
+        outline = [(a, b) for a in ends[0] for b in ends[1]]
+    else:
+        around = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
+        far = radius / math.cos(math.pi / _CORNERS)
+        outline = [(far * math.cos(angle), far * math.sin(angle)) for angle in around]
+    points = np.array([(a, b, c) for a, b in outline for c in (z[0], z[-1])])
+    rows = geometry.project(points)[..., 1]
+    behind = np.isnan(rows).any(axis=1)
+    low = np.where(behind, 0, np.floor(np.nanmin(rows, axis=1, initial=np.inf)) - 1)
+    high = np.where(behind, geometry.rows, np.ceil(np.nanmax(rows, axis=1, initial=-np.inf)) + 2)
+    low = 2 * (np.clip(low, 0, geometry.rows - 1) // 2)
+    return np.stack([low, np.clip(high, low + 1, geometry.rows)], axis=1).astype(int)
+
+
+def together(
+    rows: NDArray[np.int_], total: int, *, least: int = 16
+) -> Iterator[tuple[slice, slice | None]]:
+    """Yield runs of views that need nearly the same rows, and these.
+
+    Parameters
+    ----------
+    rows : ndarray of int, (views, 2)
+        As of :func:`rows_that_see`, of successive views.
+    total : int
+        Rows of the detector.
+    least : int
+        Views that a run has at least, but for the last.
+
+    Yields
+    ------
+    views : slice
+        Of those given.
+    rows : slice or None
+        All that they need; None for all rows, where that is hardly more.
+    """
+    start, views = 0, len(rows)
+    if float(np.mean(rows[:, 1] - rows[:, 0])) > _NEARLY_ALL * total:
+        yield slice(0, views), None
+        return
+    first, last = np.inf, -np.inf
+    for view, (low, high) in enumerate(rows):
+        wide, own = max(last, high) - min(first, low), high - low
+        if view - start >= least and wide > _WIDER * max(own, 1):
+            yield slice(start, view), slice(int(first), int(last))
+            start, first, last = view, np.inf, -np.inf
+        first, last = min(first, low), max(last, high)
+    yield slice(start, views), slice(int(first), int(last))
 
 
 def runs(chosen: NDArray[np.bool_]) -> Iterator[slice]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from clra.app.planning.cluster_plan import Site, plans, simulated
+from clra.app.planning.live_workers import live_workers
 from clra.app.planning.plan_table import plan_table
 from clra.app.planning.planned_steps import PlannedStep, Workers
 from clra.app.simulation import paper_like
@@ -47,15 +48,16 @@ def test_the_client_hands_tasks_out_one_by_one():
     assert simulated([PlannedStep("s", 8, 0.0, 0, 0)], workers(8), site) == pytest.approx(4)
 
 
-def test_processes_on_one_machine_share_its_cores():
+def test_what_the_host_does_takes_longer_where_cores_are_shared():
+    site = replace(FREE, begin_s=0.5)
     step = PlannedStep("s", 4, 40.0, 0, 0)
-    assert simulated([step], workers(4, cores_shared=True), FREE) == pytest.approx(40)
+    assert simulated([step], workers(4, slowdown=3.0), site) == pytest.approx(10 + 1.5)
 
 
 def test_plans_of_a_scan():
     geometry = paper_like("helix", 400, (128, 128))
     one, many = (plans(geometry, workers(n), FREE) for n in (1, 8))
-    assert [plan.work for plan in one] == ["fbp, full resolution", "align, 4ER-1QR-1HR"]
+    assert [plan.work for plan in one] == ["fbp, full resolution", "align, 4ER-2QR-2HR"]
     for alone, shared in zip(one, many, strict=True):
         assert alone.efficiency == pytest.approx(1, abs=0.02)
         # radiographs that several slabs see are read and filtered for each
@@ -69,12 +71,22 @@ def test_plans_of_a_scan():
 def test_workers_are_read():
     speed = replace(SPEED, budgets=Budgets.of(choose_device(), 1 << 30, 4 << 30))
     assert Workers.parse("3", speed) == Workers(3, speed, speed.budgets.slab)
-    assert Workers.parse("local:2", speed) == Workers(2, speed, speed.budgets.slab / 2, True)
     assert Workers.parse("2xdevice", speed).speed is speed
     assert Workers.parse("8xGPU", speed).speed.device == "a GPU, predicted"
     for wrong in ("0", "x4", "4xfoo", "many"):
         with pytest.raises(InputError, match="--cluster"):
             Workers.parse(wrong, speed)
+
+
+def test_workers_that_are_there_are_tested(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.chdir(tmp_path)
+    geometry = paper_like("helix", 400, (128, 128))
+    found = live_workers("local:1", geometry, max_device_memory=60 << 20)
+    assert found.count == 1 and found.slab_bytes <= 20 << 20 and found.slowdown >= 0.9
+    assert found.speed.device == choose_device().name.strip()
+    assert all(seconds > 0 for seconds in (found.speed.back, found.speed.registering))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_table_says_what_it_assumes():

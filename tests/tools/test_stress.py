@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from clra.methods.alignment.rejected_views import Rejections
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 
@@ -152,4 +154,6 @@ def test_profiles_of_helices_that_fit_by_chance_start_no_alignment(tool, kind):
     """Taken for motions, those of this seed led to 5 and 16 pixels instead of 0.07."""
     scan = tool("stress_kinds").KINDS[kind].case(12, 64).scan
     gauge = Gauge(scan.geometry, sample_points(default_grid(scan.geometry)), magnification=False)
-    assert prealigned(Stream(), scan, 2, Rejections(scan.views, ()), gauge) is None
+    stream, rejections = Stream(), Rejections(scan.views, ())
+    binned = partial(Radiographs, stream, scan)
+    assert prealigned(stream, scan.geometry, binned, 2, rejections, gauge) is None

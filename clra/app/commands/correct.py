@@ -7,6 +7,7 @@ import typer
 
 from clra.app.console import Console, Memory, Reading, ScanPath
 from clra.app.correcting import Correcting
+from clra.app.planning.cluster_option import Cluster
 
 
 def correct(
@@ -21,6 +22,7 @@ def correct(
     out: Annotated[
         Path, typer.Option("--output", "-o", metavar="CORRECTED.nxs", help="Scan to write.")
     ],
+    cluster: Cluster = None,
 ) -> None:
     """Write a scan of corrected radiographs.
 
@@ -32,6 +34,7 @@ def correct(
     Examples
     --------
       clra correct scan.nxs --motion motion.h5 -o corrected.nxs
+      clra correct scan.nxs --motion motion.h5 -o corrected.nxs --cluster local:4
     """
     from clra.app.annotations import alignment_for
     from clra.app.exit_status import command_line
@@ -50,7 +53,9 @@ def correct(
     with console.progress() as progress:
         opened = prepared(opened, correcting.options(), progress=progress)
         valid_views = used_views(opened, alignment.valid_views)
-        corrected = correct_scan(opened, alignment.motion, console.device, **limits)
+        corrected = correct_scan(
+            opened, alignment.motion, console.device, cluster=cluster, **limits
+        )
         made = provenance(
             command=command_line(), scan=opened, alignment=alignment, method="correct"
         )

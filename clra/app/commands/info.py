@@ -1,5 +1,6 @@
 """Describe a scan and what it will take."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -18,9 +19,9 @@ def info(
     cluster: Annotated[
         str | None,
         typer.Option(
-            metavar="N|local:N|NxGPU",
-            help="Also plan the work of N workers with devices like this one, of N processes here, "
-            "or of N workers with a GPU.",
+            metavar="N|NxGPU|ADDRESS|FILE|local:N",
+            help="Also plan the work of N workers with devices like this one or with a GPU, or of "
+            "workers that are there, which are tested.",
         ),
     ] = None,
 ) -> None:
@@ -40,6 +41,7 @@ def info(
     """
     from clra.app.cost import costs_of, costs_table
     from clra.app.planning.cluster_plan import plans
+    from clra.app.planning.live_workers import live_workers
     from clra.app.planning.plan_table import plan_table
     from clra.app.planning.planned_steps import Workers
     from clra.app.scan_description import Facts, scanner_text, table
@@ -76,8 +78,12 @@ def info(
     text = f"{table(facts.lines())}{told}\n\n{costs_table(costs, speed)}"
     values = {"scan": facts, "device": speed.device, "levels": costs}
     if cluster is not None:
-        workers = Workers.parse(cluster, speed)
-        values["cluster"] = planned = plans(opened.geometry, workers)
+        if ":" in cluster or Path(cluster).is_file():
+            with console.progress() as report:
+                workers = live_workers(cluster, opened.geometry, report, **limits)
+        else:
+            workers = Workers.parse(cluster, speed)
+        values["cluster"] = planned = plans(opened.geometry, workers, aligned=aligned)
         text += f"\n\n{plan_table(planned, workers)}"
     if scanner is not None:
         values["scanner"] = {

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from clra.app.planning.planned_steps import PlannedStep, Workers, steps_of_work
 from clra.model.geometry import ConeBeamGeometry
+from clra.model.grid import VolumeGrid
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Site:
         Time that the client and the scheduler take for a task [s]; 3 ms of processor time measured.
     start_s, begin_s : float
         Time that a worker takes to begin with the work, and with each task: kernels, files, tables;
-        0.7 s and 0.1 s of processor time measured.
+        0.7 s and 0.02 s of processor time measured.
     view_s : float
         Time that the client takes for a view in an iteration: gauge and stop rule [s].
     task_bytes, view_bytes : float
@@ -33,7 +34,7 @@ class Site:
     link: float = 1e9
     task_s: float = 6e-3
     start_s: float = 0.7
-    begin_s: float = 0.1
+    begin_s: float = 0.02
     view_s: float = 2e-4
     task_bytes: float = 2.5e3
     view_bytes: float = 80.0
@@ -73,7 +74,12 @@ class Plan:
     limit: str
 
 
-def plans(geometry: ConeBeamGeometry, workers: Workers, site: Site | None = None) -> list[Plan]:
+def plans(
+    geometry: ConeBeamGeometry,
+    workers: Workers,
+    site: Site | None = None,
+    aligned: VolumeGrid | None = None,
+) -> list[Plan]:
     """Plan a reconstruction at full resolution and an alignment by the default schedule.
 
     Parameters
@@ -84,12 +90,16 @@ def plans(geometry: ConeBeamGeometry, workers: Workers, site: Site | None = None
         Who does it.
     site : Site, optional
         What else there is.
+    aligned : VolumeGrid, optional
+        Where alignment reconstructs, as for :func:`steps_of_work`.
     """
     site = site or Site()
     alone = replace(workers, count=1)
     made = []
     for (work, steps, registered), (_, whole, _) in zip(
-        steps_of_work(geometry, workers), steps_of_work(geometry, alone), strict=True
+        steps_of_work(geometry, workers, aligned),
+        steps_of_work(geometry, alone, aligned),
+        strict=True,
     ):
         device = sum(step.seconds for step in whole)
         made.append(_plan(work, steps, workers, site, registered, device))
@@ -114,13 +124,12 @@ def simulated(steps: Sequence[PlannedStep], workers: Workers, site: Site) -> flo
     float
         Seconds.
     """
-    slower = workers.count if workers.cores_shared else 1
-    now = slower * site.start_s
+    now = workers.slowdown * site.start_s
     for step in steps:
         busy = min(workers.count, step.tasks)
         rate = min(site.link, site.file_system / busy)
         moved = (step.read + step.written) / step.tasks / rate
-        took = slower * (step.seconds / step.tasks + site.begin_s) + moved
+        took = step.seconds / step.tasks + workers.slowdown * site.begin_s + moved
         free = [now] * busy
         for number in range(step.tasks):
             begun = max(heapq.heappop(free), now + (number + 1) * site.task_s)
@@ -141,9 +150,8 @@ def _plan(
     seconds = simulated(steps, workers, site) + registered * site.view_s
     device = sum(step.seconds for step in steps)
     moved = sum(step.read + step.written for step in steps)
-    slower = workers.count if workers.cores_shared else 1
     parts = {
-        "device": slower * (device + tasks * site.begin_s) / workers.count,
+        "device": (device + tasks * workers.slowdown * site.begin_s) / workers.count,
         "file system": moved / min(site.file_system, site.link * workers.count),
         "client": tasks * site.task_s + registered * site.view_s,
     }

@@ -7,6 +7,9 @@ from clra.app.planning.cluster_plan import Plan, Site
 from clra.app.planning.planned_steps import Workers
 from clra.app.progress_bar import duration
 
+# Slowdown by others on the same core that is worth telling.
+_SHARED = 1.2
+
 
 def plan_table(plans: Sequence[Plan], workers: Workers) -> str:
     """Lay plans out for reading, with what they assume.
@@ -22,7 +25,8 @@ def plan_table(plans: Sequence[Plan], workers: Workers) -> str:
     rows: list[tuple[str, ...]] = [head]
     rows += [(plan.work, *cells(plan)) for plan in plans]
     site = Site()
-    shared = " and its share of this machine's cores" if workers.cores_shared else ""
+    slow = workers.slowdown
+    shared = f" and a core that is {slow:.1f} times shared" if slow > _SHARED else ""
     return "\n".join(
         [
             *columns(rows),

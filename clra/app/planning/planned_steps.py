@@ -20,6 +20,11 @@ _READ_S = 7e-9
 # A view that sees two slabs is back-projected twice, which costs as much as this many voxels more
 # for each column of voxels: 95 on a CPU with 160 columns, 93 with 256.
 _COLUMN = 95
+# To count the views that see a voxel, and divide by them, costs as much as this many voxels more
+# for each voxel.
+_COVERAGE = 55
+# Iterations of a level after which "until converged" mostly ends.
+_UNTIL_CONVERGED = 2
 # Shares of a device, as `clra.ops.streaming.memory.Budgets` has them.
 _USABLE, _SLAB = 0.75, 1 / 3
 
@@ -36,14 +41,14 @@ class Workers:
         Of one.
     slab_bytes : float
         Of a slab of the volume at most.
-    cores_shared : bool
-        Whether they share this machine's cores: each is as much slower as there are others.
+    slowdown : float
+        How much longer the host's part of the work takes than on a core of its own.
     """
 
     count: int
     speed: Speed
     slab_bytes: float
-    cores_shared: bool = False
+    slowdown: float = 1.0
 
     @classmethod
     def parse(cls, text: str, measured: Speed) -> "Workers":
@@ -61,12 +66,11 @@ class Workers:
         InputError
             If it is none of these.
         """
-        local = text.startswith("local:")
-        match = _WORKERS.fullmatch(text.removeprefix("local:"))
+        match = _WORKERS.fullmatch(text)
         if match is None:
             raise InputError(
-                f"--cluster: found {text!r}, expected a number of workers such as 8, local:4 for "
-                "processes on this machine, or 8xGPU"
+                f"--cluster: found {text!r}, expected a number of workers such as 8, 8xGPU, or "
+                "workers that are there: ADDRESS|FILE|local:N"
             )
         count, name = int(match[1]), (match[2] or "").strip().lower()
         if name == "gpu" and measured.device != _GPU.device:
@@ -76,8 +80,7 @@ class Workers:
                 f"--cluster: found {match[2] or 'no device'!r}, expected GPU or a part of the name "
                 f"of the device here, {measured.device}"
             )
-        slab = measured.budgets.slab / (count if local else 1)
-        return cls(count, measured, slab, local)
+        return cls(count, measured, measured.budgets.slab)
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ class PlannedStep:
 
 
 def steps_of_work(
-    geometry: ConeBeamGeometry, workers: Workers
+    geometry: ConeBeamGeometry, workers: Workers, aligned: VolumeGrid | None = None
 ) -> list[tuple[str, list[PlannedStep], int]]:
     """Return pieces of work: name, steps, and how many views are registered.
 
@@ -116,10 +119,14 @@ def steps_of_work(
         Of the scan.
     workers : Workers
         Who does it.
+    aligned : VolumeGrid, optional
+        Where alignment reconstructs; by default the field of view with a margin.
     """
     from clra.methods.alignment.options import Solver
+    from clra.methods.alignment.reprojection import with_margin
 
     grid = default_grid(geometry)
+    aligned = aligned or with_margin(grid)
     work = [("fbp, full resolution", [_planes(geometry, grid, workers)], 0)]
     if not math.isnan(workers.speed.exact_back) and _is_helical(geometry):
         exact = _planes(geometry, grid, workers, exact=True)
@@ -127,12 +134,12 @@ def steps_of_work(
     steps: list[PlannedStep] = []
     names, registered = [], 0
     for stage in parse_schedule("auto", geometry.shape):
-        iterations = stage.iterations or 1  # where "until converged" mostly ends
+        iterations = stage.iterations or _UNTIL_CONVERGED
         if stage.level > 1:
             steps.append(_binning(geometry, stage.level, workers))
         # What displaces the re-projections of small images is found by an iteration with them.
         more = Solver().is_biased(geometry.binned(stage.level) if stage.level > 1 else geometry)
-        steps += (iterations + more) * _iteration(geometry, grid, stage.level, workers)
+        steps += (iterations + more) * _iteration(geometry, aligned, stage.level, workers)
         registered += iterations * geometry.views
         names.append(f"{iterations}{level_name(stage.level)}")
     work.append((f"align, {'-'.join(names)}", steps, registered))
@@ -146,61 +153,64 @@ def _planes(
     from clra.methods.execution.executor import slabs_of
 
     tasks = len(slabs_of(workers.count, workers.slab_bytes, grid.shape))
-    seen = _views_of_slabs(geometry, grid, tasks)
+    seen, rows = _seen_by_slabs(geometry, grid, tasks)
+    # A scan is read view by view, and of each what is needed is filtered.
     pixels = seen * geometry.rows * geometry.columns
     speed = workers.speed
     if exact:
         seconds = exact_updates(geometry, grid) * speed.exact_back + pixels * speed.exact_filtering
     else:
         updates = math.prod(grid.shape) * views_a_voxel(geometry, grid)
-        seconds = updates * speed.back + pixels * speed.filtering
+        updates += _COVERAGE * math.prod(grid.shape)
+        seconds = updates * speed.back + rows * geometry.columns * speed.filtering
         seconds += _COLUMN * (seen - geometry.views) * math.prod(grid.shape[1:]) * speed.back
-    seconds += pixels * _READ_S
+    seconds += pixels * _READ_S * workers.slowdown
     # What workers write the client reads again, and writes into the output.
     return PlannedStep("planes", tasks, seconds, 4.0 * pixels + _bytes(grid), 2.0 * _bytes(grid))
 
 
 def _binning(geometry: ConeBeamGeometry, level: int, workers: Workers) -> PlannedStep:
-    from clra.methods.execution.shared_level import view_chunks
+    from clra.methods.shared_work.shared_scan import view_chunks
 
     stored = 4.0 * geometry.views * geometry.rows * geometry.columns
     tasks = len(view_chunks(workers.count, geometry.views))
-    return PlannedStep("binning", tasks, stored / 4 * _READ_S, stored, stored / level**2)
+    seconds = stored / 4 * _READ_S * workers.slowdown
+    return PlannedStep("binning", tasks, seconds, stored, stored / level**2)
 
 
 def _iteration(
-    geometry: ConeBeamGeometry, full: VolumeGrid, level: int, workers: Workers
+    geometry: ConeBeamGeometry, grid: VolumeGrid, level: int, workers: Workers
 ) -> list[PlannedStep]:
     """Return the steps of an iteration, as `SharedLevel` has them."""
     from clra.methods.alignment.options import Solver
-    from clra.methods.alignment.reprojection import with_margin
     from clra.methods.execution.executor import slabs_of
-    from clra.methods.execution.level_tasks import planned_volumes
-    from clra.methods.execution.shared_level import view_chunks
+    from clra.methods.reconstruction.fitted_fbp import VOLUMES
+    from clra.methods.shared_work.shared_scan import view_chunks
 
     terms = Solver().terms
     binned = geometry.binned(level) if level > 1 else geometry
-    grid = with_margin(full)
     grid = grid.binned(level) if level > 1 else grid
-    slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, planned_volumes(terms))
+    slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, VOLUMES if terms else 1)
     chunks = len(view_chunks(workers.count, geometry.views))
-    seen = _views_of_slabs(binned, grid, len(slabs))
+    seen, rows = _seen_by_slabs(binned, grid, len(slabs))
+    looked_at = rows * binned.columns
     view = float(binned.rows * binned.columns)
     updates = math.prod(grid.shape) * views_a_voxel(binned, grid)
     speed = workers.speed
     again = max(0.0, seen - binned.views) * math.prod(grid.shape[1:])
-    back = (updates + _COLUMN * again) * speed.back + seen * view * speed.filtering
+    covered = _COVERAGE * math.prod(grid.shape)
+    back = (updates + covered + _COLUMN * again) * speed.back + looked_at * speed.filtering
     forward = updates * speed.forward
     # Each chunk of views reads the slabs that it sees.
     looked = chunks * math.ceil(len(slabs) * min(1.0, seen / len(slabs) / binned.views) + 1)
     looked = min(looked, chunks * len(slabs))
     volume, images = _bytes(grid), 4.0 * binned.views * view
     fetched = volume * looked / len(slabs)
-    steps = [PlannedStep("reconstructing", len(slabs), back, 4 * seen * view, volume)]
+    steps = [PlannedStep("reconstructing", len(slabs), back, 4 * looked_at, volume)]
     for _ in range(terms):
         steps += [
             PlannedStep("simulating", chunks, forward, fetched + images, images),
-            PlannedStep("correcting", len(slabs), back, 4 * seen * view + volume, volume),
+            PlannedStep("correcting", len(slabs), back, 4 * looked_at + volume, volume),
         ]
     registering = binned.views * view * speed.registering
     return [
@@ -209,13 +219,20 @@ def _iteration(
     ]
 
 
-def _views_of_slabs(geometry: ConeBeamGeometry, grid: VolumeGrid, slabs: int) -> float:
-    """Add up the views that see each of some slabs: so many are read and filtered."""
-    from clra.model.view_selection import views_that_see
+def _seen_by_slabs(geometry: ConeBeamGeometry, grid: VolumeGrid, slabs: int) -> tuple[float, float]:
+    """Add up the views that see each of some slabs, and their rows that do."""
+    from clra.model.view_selection import rows_that_see, views_that_see
     from clra.ops.streaming.stream import equal_runs
 
-    parts = equal_runs(grid.shape[0], min(slabs, grid.shape[0]))
-    return float(sum(views_that_see(geometry, grid.slab(p.start, p.stop)).sum() for p in parts))
+    views = rows = 0
+    radius = 0.5 * grid.shape[2] * grid.voxel_size
+    for part in equal_runs(grid.shape[0], min(slabs, grid.shape[0])):
+        slab = grid.slab(part.start, part.stop)
+        seeing = views_that_see(geometry, slab)
+        low, high = rows_that_see(geometry, slab, radius)[seeing].T
+        views += int(seeing.sum())
+        rows += int((high - low).sum())
+    return float(views), float(rows)
 
 
 def _is_helical(geometry: ConeBeamGeometry) -> bool:

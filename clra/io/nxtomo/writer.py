@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -19,7 +20,7 @@ from clra.io.provenance import Provenance
 from clra.io.volumes.slab_files import SlabWriter, reserve
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
-from clra.model.scan import Projections
+from clra.model.scan import DeliveredProjections, Projections
 from clra.model.validation import checked_valid_views
 from clra.progress import ProgressCallback, tell
 
@@ -62,7 +63,7 @@ def write_nxtomo(
     path : path-like
         The file.
     radiographs : array or array-like object, (views, rows, columns)
-        Sliced along the first axis, some at a time.
+        Sliced along the first axis, some at a time; or :class:`DeliveredProjections`.
     geometry : ConeBeamGeometry
         Of the radiographs.
     flats, flats_after, darks : array or array-like object, (n, rows, columns), optional
@@ -146,22 +147,36 @@ def write_nxtomo(
                 count=len(roles),
             )
         with SlabWriter(temporary, offset, shape, pixels) as writer:
-            _copy(writer, [part for _, part in parts], reverse, progress)
+            _copy(
+                writer, [part for _, part in parts], reverse, Path(path).absolute().parent, progress
+            )
 
 
 def _copy(
-    writer: SlabWriter, parts: list[Projections], reverse: bool, progress: ProgressCallback | None
+    writer: SlabWriter,
+    parts: list[Projections],
+    reverse: bool,
+    folder: Path,
+    progress: ProgressCallback | None,
 ) -> None:
     """Write the frames of every part, one part after the other."""
     rows, columns = writer.shape[1:]
     step = max(1, _PIECE // (rows * columns * writer.dtype.itemsize))
-    done = 0
+    first = 0
+
+    def take(start: int, frames: NDArray[Any]) -> None:
+        writer.write(first + start, frames[:, ::-1] if reverse else frames)
+
     for part in parts:
-        for start in range(0, part.shape[0], step):
-            frames = np.asarray(part[start : min(start + step, part.shape[0])])
-            writer.write(done, frames[:, ::-1] if reverse else frames)
-            done += len(frames)
-            tell(progress, "writing", done, writer.shape[0])
+        count = part.shape[0]
+        if isinstance(part, DeliveredProjections):
+            part.deliver(take, folder, progress)
+        else:
+            for start in range(0, count, step):
+                stop = min(start + step, count)
+                take(start, np.asarray(part[start:stop]))
+                tell(progress, "writing", first + stop, writer.shape[0])
+        first += count
 
 
 def _detector(

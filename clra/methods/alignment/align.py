@@ -10,7 +10,7 @@ from clra.methods.alignment.coarse_to_fine import CoarseToFine
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
-from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult, finished
+from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
 from clra.methods.alignment.rigid.held_out_errors import with_standard_errors
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
 from clra.methods.alignment.rigid.rigid_start import RigidStart
@@ -18,24 +18,20 @@ from clra.methods.alignment.steps.odd_harmonics import are_open, with_odd_harmon
 from clra.methods.assessment.assess import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
-from clra.methods.execution.checkpoint import (
-    Checkpoint,
-    Saved,
-    cancelled,
-    checkpoint_of,
-    identity,
-)
-from clra.methods.execution.choice import check_for_cluster
-from clra.methods.execution.shared_level import levels_on
+from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_of, identity
+from clra.methods.execution.choice import check_for_cluster, executing
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
+from clra.methods.shared_work.shared_level import levels_by
+from clra.methods.shared_work.shared_rigid_level import rigid_levels_by
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.rigid.rigid_motion import RigidMotion
 from clra.model.scan import Scan
 from clra.model.schedule import parse_schedule
+from clra.ops.runtime.devices import usable_devices
 from clra.ops.runtime.versions import versions
 from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.stream import Stream
@@ -100,7 +96,8 @@ def align(
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
-        As :func:`clra.ops.runtime.devices.choose_device` takes it.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all" to share "ra" out to
+        all devices of the best kind.
     reference : Scan, optional
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.
@@ -131,9 +128,9 @@ def align(
         Whether to judge the result by views that are held out: a verdict, and standard errors that
         count what is left. A motion that predicts them no better than the start is not returned.
     cluster : distributed.Client or str, optional
-        Workers that reconstruct, project and register for "ra", but for `estimate` "rigid" and
-        those with a roll: a client of Dask, or "local:N", "slurm:N", the address of a scheduler or
-        its file. The scan has to be in a file. What is left for the device here is small.
+        Workers that reconstruct, project and register for "ra": a client of Dask, or "local:N",
+        "slurm:N", the address of a scheduler or its file. The scan has to be in a file. What is
+        left for the device here is small.
 
     Returns
     -------
@@ -159,7 +156,6 @@ def align(
     if estimate == "source" and isinstance(motion, RigidMotion):
         raise InputError("motion: found a rigid one with estimate='source', expected shifts")
     check_for_cluster(cluster, scan, method, ("ra",))
-    check_for_cluster(cluster, scan, estimate, [e for e in ESTIMATES if e not in FREE])
     keeping, own = checkpoint_of(checkpoint, resume)
     stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
@@ -168,8 +164,9 @@ def align(
     if (method == "reference" and reference is None) or (reference and motion):
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
+    devices = usable_devices(device, progress)
     stream = Stream(
-        device,
+        devices[0],
         max_device_memory=max_device_memory,
         max_host_memory=max_host_memory,
         report=progress,
@@ -259,25 +256,27 @@ def align(
                     "max_device_memory": max_device_memory,
                     "max_host_memory": max_host_memory,
                 }
-                with levels_on(cluster, part, keeping, progress, limits) as run.make_level:
+                with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+                    run.make_level = levels_by(executor, part)
                     run.align(stages, saved)
-                aligned = run.result()
-                fit = solver.harmonics and not cancelled(findings)
-                if fit and are_open(part, region, aligned):
-                    aligned = with_odd_harmonics(stream, part, region, aligned)
-                if estimate in FREE and not cancelled(findings):
-                    rigid = RigidAlignment(
-                        stream,
-                        part,
-                        region,
-                        solver,
-                        estimate,
-                        aligned,
-                        anchor,
-                        keeping,
-                        run.state(),
-                    )
-                    aligned = _turned(rigid, saved)
+                    aligned = run.result()
+                    fit = solver.harmonics and not cancelled(findings)
+                    if fit and are_open(part, region, aligned):
+                        aligned = with_odd_harmonics(stream, part, region, aligned)
+                    if estimate in FREE and not cancelled(findings):
+                        rigid = RigidAlignment(
+                            stream,
+                            part,
+                            region,
+                            solver,
+                            estimate,
+                            aligned,
+                            anchor,
+                            keeping,
+                            run.state(),
+                            rigid_levels_by(executor, part),
+                        )
+                        aligned = rigid.align(saved)
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
@@ -288,18 +287,6 @@ def align(
     if own and keeping is not None and not cancelled(result.warnings):
         keeping.clear()
     return result
-
-
-def _turned(rigid: RigidAlignment, saved: Saved | None) -> AlignmentResult:
-    """Go on with a rigid motion; what is finished stays if the call is ended."""
-    try:
-        return rigid.align(saved)
-    except Cancelled:
-        done = finished(rigid.done.history)
-        Finding("cancelled", f"the alignment was ended early, after {done}").warn()
-        return rigid.result()
-    except KeyboardInterrupt:
-        raise AlignmentInterrupted(rigid.result()) from None
 
 
 def _judged(

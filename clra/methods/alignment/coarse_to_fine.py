@@ -35,18 +35,8 @@ from clra.methods.alignment.result import (
 from clra.methods.alignment.steps.acceleration import MotionSteps
 from clra.methods.alignment.steps.magnifications import Magnifications
 from clra.methods.alignment.steps.slow_modes import SlowSteps
+from clra.methods.execution import packing
 from clra.methods.execution.checkpoint import Checkpoint, Saved
-from clra.methods.execution.packing import (
-    State,
-    history_from,
-    history_values,
-    motion_arrays,
-    motion_from,
-    prealigned_arrays,
-    prealigned_from,
-    registered_arrays,
-    registered_from,
-)
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -149,17 +139,24 @@ class CoarseToFine:
     def _prealign(self, coarsest: int) -> None:
         """Begin with what sums over the radiographs tell, if it is of use."""
         started = time.perf_counter()
-        found = prealigned(self.stream, self.scan, coarsest, self.rejections, self.shift_gauge)
+        found = prealigned(
+            self.stream,
+            self.scan.geometry,
+            lambda factor: self._level(factor).radiographs,
+            coarsest,
+            self.rejections,
+            self.shift_gauge,
+        )
         if found is None:
-            column = axis_column(self.stream, self.scan)
+            column = axis_column(self.stream, self.scan, lambda: self._level(1).radiographs)
             self.motion = self.origin = replace(self.start, shift_u=self.start.shift_u + column)
             return
         self._begin_with(found)
         seconds = time.perf_counter() - started
         self.history.append(found.entry(seconds, **self._errors()))
         if self.checkpoint is not None:
-            values = {"position": (0, 0), "history": history_values(self.history)}
-            self.checkpoint.save(finished(self.history), values, prealigned_arrays(found))
+            values = {"position": (0, 0), "history": packing.history_values(self.history)}
+            self.checkpoint.save(finished(self.history), values, packing.prealigned_arrays(found))
 
     def _begin_with(self, found: Prealignment) -> None:
         """Take shifts from a pre-alignment; magnifications are right on average, not in a view."""
@@ -171,7 +168,7 @@ class CoarseToFine:
         """Algorithm 2, steps 1 to 6 (and 7 to 13 at the next level), after `done` iterations."""
         name = level_name(stage.level)
         # 1, 7: down-sample the measured radiographs
-        level = self.make_level(self.stream, self.scan, self.region, self.solver, stage.level)
+        level = self._level(stage.level)
         if self.registered is None:
             self.rejected = self.rejections.first(self.stream, level.radiographs)
         # Each level ends a little aside of the one before: extrapolated by the last, short steps of
@@ -271,6 +268,9 @@ class CoarseToFine:
         self.motion = self.steps.next(self.motion, there, plain=self.fresh)
         return step, note
 
+    def _level(self, factor: int) -> Level:
+        return self.make_level(self.stream, self.scan, self.region, self.solver, factor)
+
     def _keep(self, stage: int, done: int) -> None:
         """Keep what the iterations so far gave: `done` of a stage."""
         last = self.history[-1]
@@ -286,36 +286,37 @@ class CoarseToFine:
         if self.checkpoint is not None:
             self.checkpoint.save(finished(self.history), *self.state())
 
-    def state(self) -> State:
+    def state(self) -> packing.State:
         """Return the plain values and arrays by which an interrupted alignment goes on."""
         level, update = self.last
-        arrays = motion_arrays("motion", self.motion) | motion_arrays("found", self.found)
+        arrays = packing.prealigned_arrays(self.prealigned)
+        for name in ("motion", "found", "origin"):
+            arrays |= packing.motion_arrays(name, getattr(self, name))
         arrays |= {"rejected": self.rejected, "update": update}
         arrays["accepted"] = self.rejections.accepted
-        arrays |= prealigned_arrays(self.prealigned) | motion_arrays("origin", self.origin)
         values = {
             "position": self.position,
-            "history": history_values(self.history),
+            "history": packing.history_values(self.history),
             "level": level,
             "fresh": self.fresh,
             "reasons": list(self.rejections.reasons.items()),
         }
-        return values, arrays | registered_arrays(self.registered)
+        return values, arrays | packing.registered_arrays(self.registered)
 
     def _go_on_from(self, saved: Saved) -> tuple[int, int]:
         """Take up a kept state; return the stage and how many of its iterations are done."""
         arrays, values, cause = saved.arrays, saved.values, self.start.cause
-        before = prealigned_from(arrays)
+        before = packing.prealigned_from(arrays)
         if before is not None:
             self._begin_with(before)
-        self.history = history_from(values["history"])
+        self.history = packing.history_from(values["history"])
         stage, done = self.position = tuple(values["position"])
-        self.registered = registered_from(arrays)
+        self.registered = packing.registered_from(arrays)
         if self.registered is None:
             return stage, done
-        self.origin = motion_from(arrays, "origin", cause)
-        self.motion = motion_from(arrays, "motion", cause)
-        self.found = motion_from(arrays, "found", cause)
+        self.origin = packing.motion_from(arrays, "origin", cause)
+        self.motion = packing.motion_from(arrays, "motion", cause)
+        self.found = packing.motion_from(arrays, "found", cause)
         self.rejected, self.fresh = arrays["rejected"], values["fresh"]
         self.rejections.accepted = arrays["accepted"].astype(np.bool_)
         self.rejections.reasons = {int(view): reason for view, reason in values["reasons"]}

@@ -113,7 +113,7 @@ class Level:
     def _binned(self) -> Radiographs:
         return Radiographs(self.stream, self.scan, self.factor)
 
-    def _reconstructed(self, at: "At", radiographs: Radiographs, stage: str) -> Any:
+    def _reconstructed(self, at: "At", radiographs: Any, stage: str) -> Any:
         """Return a volume that :meth:`_registered` and :meth:`_simulated` take."""
         return fitted_fbp(
             self.stream,
@@ -129,9 +129,7 @@ class Level:
             stage=stage,
         )
 
-    def _registered(
-        self, at: "At", radiographs: Radiographs, volume: Any, stage: str
-    ) -> Registered:
+    def _registered(self, at: "At", radiographs: Any, volume: Any, stage: str) -> Registered:
         return reproject_and_register(
             self.stream,
             radiographs,

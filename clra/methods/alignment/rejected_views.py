@@ -127,7 +127,7 @@ def unusable_radiographs(stream: Stream, radiographs: Radiographs) -> dict[int, 
     Parameters
     ----------
     stream : Stream
-        Memory budget.
+        Memory budget, and whom to tell how far it is.
     radiographs : Radiographs
         Line integrals at any resolution; all are read once.
 
@@ -137,10 +137,7 @@ def unusable_radiographs(stream: Stream, radiographs: Radiographs) -> dict[int, 
         Views whose mean or standard deviation of the pixels is far from those of all views and from
         those of the views before and after as well, and what they are. Fewer than half of them.
     """
-    views = radiographs.shape[0]
-    sums = np.empty((2, views))
-    for chunk in stream.chunks(views, radiographs.view_bytes):
-        sums[:, chunk] = sums_of(radiographs.read(chunk))
+    sums = radiographs.tabulated(stream, _sums_of_each, "looking for blank radiographs").T
     means, deviations = np.median(sums, axis=1)
     return {
         int(view): _DARK
@@ -156,6 +153,10 @@ def sums_of(images: NDArray[np.float32]) -> Floats:
     """Return mean and standard deviation of each of some images, (2, views)."""
     axes = (1, 2)
     return np.stack([images.mean(axes, dtype=np.float64), images.std(axes, dtype=np.float64)])
+
+
+def _sums_of_each(images: NDArray[np.float32], views: slice) -> Floats:
+    return sums_of(images).T
 
 
 def odd(sums: Floats) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ sinogram decides.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from clra.model.detector_pose import with_detector
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.sampling.angular_coverage import beside_views, covered, holes
 from clra.model.scan import Scan
+from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -37,7 +39,9 @@ _FEWEST, _CONTRAST = 0.002, 1.5
 _PAIRS, _HALF_TURN, _SPECTRAL_CONTRAST = 1.0, 0.95 * math.pi, 1.2
 
 
-def axis_offset(stream: Stream, scan: Scan) -> tuple[float, float]:
+def axis_offset(
+    stream: Stream, scan: Scan, radiographs: Radiographs | None = None
+) -> tuple[float, float]:
     """Find the column of the axis by what is measured twice, or by the sinogram's spectrum.
 
     Parameters
@@ -46,6 +50,8 @@ def axis_offset(stream: Stream, scan: Scan) -> tuple[float, float]:
         Memory budget, and whom to tell how far it is.
     scan : Scan
         Of half a turn at least, and of a fan rather half a turn and the fan.
+    radiographs : Radiographs, optional
+        Those of the scan, as somebody else reads them: all are read.
 
     Returns
     -------
@@ -60,7 +66,10 @@ def axis_offset(stream: Stream, scan: Scan) -> tuple[float, float]:
     InputError
         If hardly any ray is measured twice, or no offset makes them agree.
     """
-    lines = _sinogram(stream, scan)
+    radiographs = radiographs or Radiographs(stream, scan, 1)
+    # Line integrals at the height of each source.
+    middle = np.clip(np.rint(scan.geometry.principal[:, 1]), 0, scan.geometry.rows - 1).astype(int)
+    lines = radiographs.tabulated(stream, _MeanRows(middle), "auto-focus: reading")
     cost, contrast = _criterion(scan.geometry)
     reach, step, centre = _REACH * scan.geometry.columns, _STEP, 0.0
     searched = np.arange(-reach, reach + 0.5 * step, step)
@@ -108,16 +117,16 @@ def _measured_twice(geometry: ConeBeamGeometry) -> NDArray[np.bool_]:
     return beside_views(other, holes(geometry), float(np.median(np.diff(np.sort(angle)))))
 
 
-def _sinogram(stream: Stream, scan: Scan) -> Floats:
-    """Line integrals at the height of each source, (views, columns)."""
-    lines = np.empty((scan.views, scan.geometry.columns))
-    middle = np.clip(np.rint(scan.geometry.principal[:, 1]), 0, scan.geometry.rows - 1).astype(int)
-    for view in range(scan.views):
-        stream.report("auto-focus: reading", view, scan.views)
-        low = max(0, middle[view] - _ROWS // 2)
-        rows = scan.read(view, view + 1)[0, low : low + _ROWS]
-        lines[view] = rows.mean(axis=0, dtype=np.float64)
-    return lines
+@dataclass(frozen=True)
+class _MeanRows:
+    """Means of a few rows of each of some views, (n, columns)."""
+
+    middle: NDArray[np.intp]
+
+    def __call__(self, images: NDArray[np.float32], views: slice) -> Floats:
+        first = np.maximum(0, self.middle[views] - _ROWS // 2)
+        rows = [image[row : row + _ROWS] for image, row in zip(images, first, strict=True)]
+        return np.stack([some.mean(axis=0, dtype=np.float64) for some in rows])
 
 
 def _disagreement(lines: Floats, ideal: ConeBeamGeometry, offset: float) -> float:

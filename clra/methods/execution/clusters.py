@@ -4,17 +4,13 @@ import logging
 import re
 import shutil
 import tempfile
-import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from clra.errors import ClusterError, InputError
-from clra.methods.execution.checkpoint import Checkpoint
 from clra.methods.execution.dask_cluster import DaskCluster
-from clra.methods.execution.travelling import check_travels
-from clra.model.scan import Scan
 from clra.progress import ProgressCallback
 
 CHOICES = "ADDRESS|FILE|local:N|slurm:N"
@@ -26,8 +22,7 @@ _CONNECTING = 30
 @contextmanager
 def on_cluster(
     cluster: Any,
-    scan: Scan,
-    checkpoint: Checkpoint | None,
+    folder: Path,
     progress: ProgressCallback | None,
     limits: dict[str, Any],
 ) -> Iterator[DaskCluster]:
@@ -38,25 +33,19 @@ def on_cluster(
     cluster : distributed.Client or str
         A client; or the address of a scheduler, its file, "local:N" for N worker processes on this
         machine, or "slurm:N" for N jobs as dask-jobqueue is configured.
-    scan : Scan
-        That the workers will read.
-    checkpoint : Checkpoint, optional
-        Of the call: files for the workers go beside it, else into the current folder.
-    progress, limits
+    folder, progress, limits
         As for :class:`DaskCluster`.
 
     Raises
     ------
     InputError
-        If dask.distributed is not installed, the text is none of these, or the scan is in memory
-        only.
+        If dask.distributed is not installed, or the text is none of these.
     ClusterError
         If there is no scheduler, or as :class:`DaskCluster` raises it.
     """
-    check_travels(scan)
     with ExitStack() as stack:
         client = stack.enter_context(_client(cluster)) if isinstance(cluster, str) else cluster
-        executor = DaskCluster(client, _folder(checkpoint), progress=progress, **limits)
+        executor = DaskCluster(client, folder, progress=progress, **limits)
         stack.callback(executor.close)
         yield executor
 
@@ -137,11 +126,3 @@ def _slurm(jobs: int) -> Iterator[Any]:
     with cluster:
         cluster.scale(jobs=jobs)
         yield cluster
-
-
-def _folder(checkpoint: Checkpoint | None) -> Path:
-    """Where the workers' files go."""
-    if checkpoint is None:
-        return Path(f"clra-{uuid.uuid4().hex[:8]}.tasks")
-    kept = checkpoint.folder
-    return kept.with_name(f"{kept.name.removesuffix('.resume')}.tasks")

@@ -86,6 +86,8 @@ class DaskCluster:
             self.close()
             raise
         known = {address: fact for address, fact in found.items() if not fact.failure}
+        # A task takes its worker's GPU, where all workers were started with one.
+        self._resources = {"GPU": 1} if all(fact.gpu for fact in known.values()) else None
         self.places = len(known)
         hosts = Counter(fact.host for fact in known.values())
         device = min(fact.device_memory for fact in known.values()) * 3 // 4
@@ -230,6 +232,7 @@ class _Waiting:
             pure=False,
             priority=-number,
             workers=(where := cluster.usable()),
+            resources=cluster._resources,
         )
         self.futures[future], self._where[future] = number, where
         self._ready.watch(future)

@@ -80,6 +80,37 @@ class Executor(Protocol):
         ...
 
 
+class Held(Protocol):
+    """A value that tasks have in common."""
+
+    def get(self) -> Any:
+        """Return the value."""
+        ...
+
+
+class WorkerGroup(Executor, Protocol):
+    """Several that execute at a time, and leave files for each other.
+
+    Attributes
+    ----------
+    slab_bytes : int
+        That the smallest device takes of a volume at a time.
+    """
+
+    @property
+    def slab_bytes(self) -> int:
+        """Most bytes of a slab; see above."""
+        ...
+
+    def share(self, value: Any) -> Held:
+        """Give all tasks a value, once."""
+        ...
+
+    def new_folder(self, name: str) -> Path:
+        """Make a folder that no task has written to."""
+        ...
+
+
 class InProcess:
     """Tasks one after the other on the device of a stream, which reports progress itself.
 
@@ -157,7 +188,7 @@ def slabs_of(
     Parameters
     ----------
     places : int
-        Workers.
+        WorkerGroup.
     slab_bytes : float
         That the smallest device takes.
     shape : (int, int, int)

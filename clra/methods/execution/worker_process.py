@@ -10,7 +10,6 @@ import platform
 import sys
 import threading
 import traceback
-import warnings
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +39,8 @@ class WorkerFacts:
         Bytes that the device has and gives at once, and that the machine has free.
     shared : bool
         Whether the device works in the machine's memory.
+    gpu : bool
+        Whether the worker was started with Dask's resource "GPU".
     """
 
     host: str
@@ -49,6 +50,7 @@ class WorkerFacts:
     largest_buffer: int = 0
     host_memory: int = 0
     shared: bool = False
+    gpu: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ def facts(neighbours: int, shared_file: str) -> WorkerFacts:
             largest_buffer=device.max_mem_alloc_size,
             host_memory=host_memory(),
             shared=profile_of(device).shared_memory,
+            gpu=_resources().get("GPU", 0) >= 1,
         )
 
 
@@ -141,12 +144,10 @@ def run(path: str, item: Any, settings: Settings) -> Outcome:
     """
     with _lock:  # one device: tasks take turns, however many threads a worker has
         _prepare(settings.neighbours)
-        from clra.errors import ClraWarning
         from clra.findings import collected
 
         me = _name()
-        with collected() as findings, warnings.catch_warnings():
-            warnings.simplefilter("ignore", ClraWarning)  # told by the caller's process
+        with collected(silent=True) as findings:  # told by the caller's process
             try:
                 task = _task(path)
                 result = task(_stream(settings), item)
@@ -185,6 +186,13 @@ def _number() -> int | None:
 
     name = get_worker().name
     return name if isinstance(name, int) else None
+
+
+def _resources() -> dict[str, float]:
+    """Return what the worker was started with, such as {"GPU": 1}."""
+    from distributed import get_worker
+
+    return dict(get_worker().state.total_resources)
 
 
 def _name() -> tuple[str, str]:

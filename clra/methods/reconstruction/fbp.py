@@ -1,6 +1,7 @@
 """Ramp-filtered back-projection for any trajectory, streamed."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.sampling.angular_coverage import angle_weights
 from clra.model.sampling.ray_weights import ray_weights
-from clra.model.view_selection import runs, views_that_see
+from clra.model.view_selection import rows_that_see, runs, together, views_that_see
 from clra.ops.filtering.ramp import FADE, RampFilter, taper
 from clra.ops.projection.coverage import Coverage, around
 from clra.ops.projection.projector import BackProjector
@@ -148,13 +149,13 @@ def ramp_fbp(
         attenuation.fill(np.float32(0), queue=queue)
         back = BackProjector(context, ramp.geometry, slab, volume_order="yxz", **memory)
         busy: list[tuple[cl.Event, tuple[Any, ...]]] = []
+        needed = rows_that_see(geometry, slab, coverage.radius)
         for run in runs(seeing[index]):
-            for chunk in stream.chunks(run.stop - run.start, filtered_bytes):
-                views = slice(run.start + chunk.start, run.start + chunk.stop)
+            for views, rows in _pieces(stream, radiographs, run, needed, filtered_bytes):
                 stream.report(stage, done, total)
-                measured = radiographs.on_device(stream, views)
+                measured = radiographs.on_device(stream, views, rows)
                 filtered = stream.empty((len(measured), *ramp.geometry.shape))
-                ready = ramp(queue, filtered, measured, views=views)
+                ready = ramp(queue, filtered, measured, views=views, rows=rows)
                 event = back(
                     queue, attenuation, filtered, views=views, accumulate=True, wait_for=[ready]
                 )
@@ -180,3 +181,20 @@ def ramp_fbp(
         queue.finish()
     stream.report(stage, total, total)
     return volume
+
+
+def _pieces(
+    stream: Stream,
+    radiographs: Radiographs,
+    run: slice,
+    needed: NDArray[np.int_],
+    view_bytes: int,
+) -> Iterator[tuple[slice, slice | None]]:
+    """Cut a run of views into what fits the device and needs the same rows; None for all rows."""
+    for chunk in stream.chunks(run.stop - run.start, view_bytes):
+        start, stop = run.start + chunk.start, run.start + chunk.stop
+        if radiographs.stay_on(stream):
+            yield slice(start, stop), None
+            continue
+        for views, rows in together(needed[start:stop], radiographs.shape[1]):
+            yield slice(start + views.start, start + views.stop), rows

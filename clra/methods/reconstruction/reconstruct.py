@@ -284,7 +284,7 @@ def reconstruct_into(
             alignment = found or alignment
         else:
             work = SomePlanes(scan, grid, motion, valid_views, fitted, window)
-            with executing(stream, devices, cluster, scan, keeping, progress, limits) as executor:
+            with executing(stream, devices, cluster, keeping, progress, limits) as executor:
                 reconstruct_planes(executor, work, grid.shape, target, stage="back-projecting")
     if own and keeping is not None and not cancelled(findings):
         keeping.clear()

@@ -13,7 +13,7 @@ from clra.errors import InputError
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.sampling.ray_weights import RayWeights, widened
 from clra.ops.filtering.fft import RealFFT, fast_length
-from clra.ops.filtering.ramp_transform import RampTransform, transform_length
+from clra.ops.filtering.ramp_transform import RampTransform, ramp_spectrum, transform_length
 from clra.ops.projection.view_arguments import check_geometry, successive, view_weights
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
 from clra.ops.runtime.kernel import Step
@@ -155,7 +155,7 @@ class RampFilter:
         self._roll = to_device(context, _roll(self.padded - self._columns, margin, self._columns))
         self._last: list[cl.Event] = []
         self.set_geometry(geometry)
-        spectrum = _ramp_spectrum(self.padded, window)
+        spectrum = ramp_spectrum(self.padded, window)
         self._transform = RampTransform(context, spectrum) if length else None
         self.scratch_bytes = 0
         if length is None:
@@ -207,21 +207,24 @@ class RampFilter:
         projections: Array,
         *,
         views: slice | None = None,
+        rows: slice | None = None,
         wait_for: Sequence[cl.Event] | None = None,
     ) -> cl.Event:
-        """Filter radiographs.
+        """Filter radiographs, or some rows of them.
 
         Parameters
         ----------
         queue : cl.CommandQueue
             In order or out of order.
         filtered_out : cl.array.Array
-            float32 (n, rows, columns) of :attr:`geometry` [1/mm], overwritten; may be `projections`
-            itself if that is not wider.
+            float32 (n, rows, columns) of :attr:`geometry` [1/mm], overwritten, but for other rows;
+            may be `projections` itself if that has the same shape.
         projections : cl.array.Array
             float32 (n, rows, columns), line integrals.
         views : slice, optional
             The n successive views of the geometry that these are; all by default.
+        rows : slice, optional
+            The successive rows of the detector that `projections` has; all by default.
         wait_for : sequence of cl.Event, optional
             What has to be done before.
 
@@ -236,11 +239,12 @@ class RampFilter:
         """
         check_queue(queue, self._context)
         start, stop = successive(views, self._views)
-        shape = (stop - start, self._rows, self._columns)
+        top, bottom = successive(rows, self._rows, "rows")
+        shape = (stop - start, bottom - top, self._columns)
         check_array("projections", projections, shape, context=self._context)
         filtered_shape = (shape[0], *self.geometry.shape)
         check_array("filtered_out", filtered_out, filtered_shape, context=self._context)
-        total = shape[0] * self._rows
+        total = shape[0] * shape[1]
         events = [*(wait_for or ()), *self._last]
         sizes = (self._columns, self.padded)
         rays, stride = self._alike, 0
@@ -250,7 +254,7 @@ class RampFilter:
         if self._transform is not None:
             tables = self._view_table[start:], self._row_weight, rays, self._roll
             event = self._transform(
-                queue, filtered_out, projections, tables, stride, self._wider[0], events
+                queue, filtered_out, projections, tables, stride, self._wider[0], top, events
             )
             self._last = [event]
             return event
@@ -268,7 +272,8 @@ class RampFilter:
                 self._roll,
                 first,
                 count,
-                self._rows,
+                shape[1],
+                top,
                 *sizes,
                 stride,
                 wait_for=events,
@@ -281,6 +286,9 @@ class RampFilter:
                 part,
                 first,
                 count,
+                shape[1],
+                top,
+                self._rows,
                 self.geometry.columns,
                 self.padded,
                 self._wider[0],
@@ -330,18 +338,3 @@ def _roll(length: int, margin: int, columns: int) -> NDArray[np.float64]:
     if margin:
         weights[:margin] = np.sqrt((radius**2 - distance**2) / (radius**2 - edge**2))
     return np.maximum(weights, weights[::-1])
-
-
-def _ramp_spectrum(length: int, window: str) -> NDArray[np.float32]:
-    """Spectrum of the band-limited ramp: sampling |frequency| itself would lose the mean."""
-    n = np.arange(length)
-    n = np.minimum(n, length - n)
-    kernel = np.where(n % 2 == 1, -1 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
-    kernel[0] = 0.25
-    frequency = np.arange(length // 2 + 1) / length  # cycles a column, up to 1/2
-    factor = {
-        "ram-lak": np.ones_like(frequency),
-        "shepp-logan": np.sinc(frequency),
-        "hann": 0.5 + 0.5 * np.cos(2 * np.pi * frequency),
-    }[window]
-    return np.ascontiguousarray(np.fft.rfft(kernel).real * factor, np.float32)

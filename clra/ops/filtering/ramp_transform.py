@@ -55,9 +55,10 @@ class RampTransform:
         tables: Sequence[Array],
         ray_stride: int,
         before: int,
+        top: int,
         wait_for: Sequence[cl.Event],
     ) -> cl.Event:
-        """Filter all rows; `tables` are the views', the weights of rows and rays, and the roll."""
+        """Filter rows from `top` on; `tables` are of views, weights of rows and rays, and roll."""
         views, rows, columns = projections.shape
         return self._step(
             queue,
@@ -68,6 +69,8 @@ class RampTransform:
             self._spectrum,
             self._twiddles,
             rows,
+            top,
+            filtered.shape[1],
             columns,
             ray_stride,
             filtered.shape[2],
@@ -86,3 +89,28 @@ def digit_reversed(length: int) -> NDArray[np.int64]:
         frequency += place // span % radix * weight
         weight *= radix
     return frequency
+
+
+def ramp_spectrum(length: int, window: str) -> NDArray[np.float32]:
+    """Return the spectrum of the band-limited ramp times a window, (length / 2 + 1,).
+
+    Sampling |frequency| itself would lose the mean.
+
+    Parameters
+    ----------
+    length : int
+        Of a line.
+    window : {"ram-lak", "shepp-logan", "hann"}
+        See :class:`clra.ops.filtering.ramp.RampFilter`.
+    """
+    n = np.arange(length)
+    n = np.minimum(n, length - n)
+    kernel = np.where(n % 2 == 1, -1 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
+    kernel[0] = 0.25
+    frequency = np.arange(length // 2 + 1) / length  # cycles a column, up to 1/2
+    factor = {
+        "ram-lak": np.ones_like(frequency),
+        "shepp-logan": np.sinc(frequency),
+        "hann": 0.5 + 0.5 * np.cos(2 * np.pi * frequency),
+    }[window]
+    return np.ascontiguousarray(np.fft.rfft(kernel).real * factor, np.float32)

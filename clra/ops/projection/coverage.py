@@ -72,6 +72,8 @@ class Coverage:
     ----------
     scratch_bytes : int
         Of scratch memory, which holds W.
+    radius : float
+        Of the circle outside which volumes are set to zero [mm]; infinite if there is none.
 
     Raises
     ------
@@ -140,7 +142,7 @@ class Coverage:
         most = _most_views(geometry, self._row_weight, self._view_weight)
         self._least = _LEAST * (most if self._rays is None else 1.0)
         radius = max(0.0, float(np.quantile(field_radii(geometry), _BLIND)))
-        self._radius = radius / self._grid.voxel_size if self._circle else math.inf
+        self.radius = radius if self._circle else math.inf
 
     def _coarse_matrices(self, geometry: ConeBeamGeometry) -> np.ndarray:
         """Projection matrices from the middles of coarse voxels."""
@@ -253,7 +255,7 @@ class Coverage:
             1.0 / float(self._blocks[2]),
             float(-x[0] / size),
             float(-y[0] / size),
-            self._radius,
+            self.radius / self._grid.voxel_size,
             self._least,
             float(scale),
             float(lowest),

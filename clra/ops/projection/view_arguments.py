@@ -27,24 +27,26 @@ def check_geometry(geometry: ConeBeamGeometry, expected: tuple[int, int, int]) -
         raise InputError(f"geometry: found {found}, expected {expected} as (views, rows, columns)")
 
 
-def successive(views: slice | None, total: int) -> tuple[int, int]:
-    """Return the first of the views chosen, and one past the last.
+def successive(chosen: slice | None, total: int, name: str = "views") -> tuple[int, int]:
+    """Return the first of the views, or rows, that are chosen, and one past the last.
 
     Parameters
     ----------
-    views : slice or None
+    chosen : slice or None
         Of `total` views; all if None.
     total : int
         Number of views of the geometry.
+    name : str
+        For the error.
 
     Raises
     ------
     InputError
         If these are not one or more successive views.
     """
-    start, stop, step = (slice(None) if views is None else views).indices(total)
+    start, stop, step = (slice(None) if chosen is None else chosen).indices(total)
     if step != 1 or stop <= start:
-        raise InputError(f"views: found {views}, expected successive ones of {total}")
+        raise InputError(f"{name}: found {chosen}, expected successive ones of {total}")
     return start, stop
 
 

@@ -244,19 +244,33 @@ class Store:
         if self._memory is None:
             self._file.close()
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Elements `start` to `stop - 1` of the first axis; not to be written to."""
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Elements `start` to `stop - 1` of the first axis; not to be written to.
+
+        Of those of three axes, some successive ones of the second, if these are given.
+        """
         if self._memory is not None:
-            return self._memory[start:stop]
-        part = np.empty((stop - start, *self.shape[1:]), np.float32)
+            part = self._memory[start:stop]
+            return part if rows is None else np.ascontiguousarray(part[:, rows])
+        if rows is None:
+            part = np.empty((stop - start, *self.shape[1:]), np.float32)
+            self._read_into(start * self._stride, part)
+            return part
+        part = np.empty((stop - start, rows.stop - rows.start, self.shape[2]), np.float32)
+        for index, image in enumerate(part):
+            row = (start + index) * self.shape[1] + rows.start
+            self._read_into(4 * row * self.shape[2], image)
+        return part
+
+    def _read_into(self, place: int, part: Floats) -> None:
+        """Fill an array from a byte of the file on."""
         view = _bytes(part)
-        self._file.seek(start * self._stride)
+        self._file.seek(place)
         while view:
             count = self._file.readinto(view)
             if not count:
                 raise OSError(f"a temporary file in {tempfile.gettempdir()} ended early")
             view = view[count:]
-        return part
 
     def write(self, start: int, part: Floats) -> None:
         """Replace the elements from `start` of the first axis on."""

@@ -1,4 +1,4 @@
-"""Radiographs and volumes in files that several processes share, each file written by one.
+"""Radiographs, tables and volumes in files that several processes share, each file written by one.
 
 A file appears whole or not at all. It is written under a name of its own and renamed, so that work
 that is done twice, because one worker seemed lost, writes the same file twice and does no harm.
@@ -8,7 +8,7 @@ import math
 import os
 import uuid
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,7 +26,7 @@ from clra.ops.streaming.volume import PlaneWriter, Volume
 
 Floats = NDArray[np.float32]
 
-# Bytes that are on the host at a time when planes are handed on.
+# Bytes that are on the host at a time when planes or radiographs are handed on.
 _PIECE_BYTES = 32 << 20
 
 
@@ -65,17 +65,31 @@ class RadiographParts:
         with whole_file(self._path(views)) as file:
             file.write(_bytes(np.ascontiguousarray(images, np.float32)))
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Return the views `start` to `stop - 1`, of one file or several."""
-        out = np.empty((stop - start, *self.shape[1:]), np.float32)
-        stride = 4 * self.shape[1] * self.shape[2]
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Return the views `start` to `stop - 1`, or rows of them, of one file or several."""
+        _, height, columns = self.shape
+        wanted = rows or slice(0, height)
+        out = np.empty((stop - start, wanted.stop - wanted.start, columns), np.float32)
         for part in self.parts:
             first, last = max(start, part.start), min(stop, part.stop)
-            if first < last:
-                with open(self._path(part), "rb", buffering=0) as file:
-                    file.seek((first - part.start) * stride)
-                    _read_into(file, out[first - start : last - start])
+            if first >= last:
+                continue
+            with open(self._path(part), "rb", buffering=0) as file:
+                pieces = [slice(first, last)]
+                if rows is not None:
+                    pieces = [slice(view, view + 1) for view in range(first, last)]
+                for views in pieces:
+                    row = (views.start - part.start) * height + wanted.start
+                    file.seek(4 * row * columns)
+                    _read_into(file, out[views.start - start : views.stop - start])
         return out
+
+    def hand_on(self, views: slice, take: Callable[[int, Floats], None]) -> None:
+        """Give one of the parts to what takes all radiographs, some at a time; remove the file."""
+        step = max(1, _PIECE_BYTES // (4 * self.shape[1] * self.shape[2]))
+        for start, stop in pairwise([*range(views.start, views.stop, step), views.stop]):
+            take(start, self.read(start, stop))
+        self._path(views).unlink()
 
     def some(self, views: slice) -> "SomeParts":
         """Return consecutive views as radiographs of their own."""
@@ -97,9 +111,34 @@ class SomeParts:
         """Views, rows, columns."""
         return (self.views.stop - self.views.start, *self.whole.shape[1:])
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Return the views `start` to `stop - 1` of these."""
-        return self.whole.read(self.views.start + start, self.views.start + stop)
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Return the views `start` to `stop - 1` of these, or rows of them."""
+        return self.whole.read(self.views.start + start, self.views.start + stop, rows)
+
+
+@dataclass(frozen=True)
+class TableParts:
+    """Numbers of each view, (views, ...), those of some consecutive views in each file.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the files.
+    """
+
+    folder: Path
+
+    def write(self, views: slice, rows: NDArray[np.float64]) -> None:
+        """Write what is known of some views."""
+        with whole_file(self._path(views)) as file:
+            np.save(file, rows)
+
+    def read(self, parts: Iterable[slice]) -> NDArray[np.float64]:
+        """Return what is known of all views, given those of each file in order."""
+        return np.concatenate([np.load(self._path(views)) for views in parts])
+
+    def _path(self, views: slice) -> Path:
+        return self.folder / f"rows-{views.start:06}"
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Radiographs of one resolution, read in chunks."""
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float32]
 
+PerView = Callable[[Floats, slice], NDArray[np.float64]]
+"""Returns numbers (n, ...) of each of some radiographs (n, rows, columns), given which views."""
+
 
 class KeptRadiographs(Protocol):
     """Where radiographs are kept, such as `Store`."""
@@ -23,8 +27,8 @@ class KeptRadiographs(Protocol):
         """Views, rows, columns."""
         ...
 
-    def read(self, start: int, stop: int) -> Floats:
-        """Return the views `start` to `stop - 1`."""
+    def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
+        """Return the views `start` to `stop - 1`, or some successive rows of them."""
         ...
 
 
@@ -64,7 +68,7 @@ class Radiographs:
         self._kept: KeptRadiographs | None = self._read_all() if level > 1 or keep else None
 
     @classmethod
-    def of(cls, kept: KeptRadiographs, level: int) -> "Radiographs":
+    def of(cls, kept: KeptRadiographs, level: int) -> Self:
         """Radiographs (views, rows, columns) of a level that are known already."""
         known = cls.__new__(cls)
         views, rows, columns = kept.shape
@@ -77,16 +81,24 @@ class Radiographs:
         """Bytes of one radiograph at this level."""
         return 4 * self.shape[1] * self.shape[2]
 
-    def read(self, views: slice) -> Floats:
-        """Radiographs `views`, float32 (n, rows, columns)."""
-        if self._kept is None:
-            return self._scan.read(views.start, views.stop)
-        return self._kept.read(views.start, views.stop)
+    def read(self, views: slice, rows: slice | None = None) -> Floats:
+        """Radiographs `views`, or some rows of them, float32 (n, rows, columns)."""
+        if self._kept is not None:
+            return self._kept.read(views.start, views.stop, rows)
+        whole = self._scan.read(views.start, views.stop)
+        return whole if rows is None else np.ascontiguousarray(whole[:, rows])
 
-    def on_device(self, stream: Stream, views: slice) -> Array:
-        """Radiographs `views` on a stream's device; they have to stay as they are."""
+    def stay_on(self, stream: Stream) -> bool:
+        """Whether a stream's device keeps them: then it has all rows."""
+        return self._uploaded is not None and keeps(stream.budgets, self.shape)
+
+    def on_device(self, stream: Stream, views: slice, rows: slice | None = None) -> Array:
+        """Radiographs `views` on a stream's device, or some rows of those that do not stay there.
+
+        They have to stay as they are.
+        """
         if self._uploaded is None or not keeps(stream.budgets, self.shape):
-            return stream.upload(self.read(views))
+            return stream.upload(self.read(views, rows))
         if self._resident is None:
             self._resident = stream.empty(self.shape)
         for run in runs(~self._uploaded[views]):
@@ -95,6 +107,25 @@ class Radiographs:
             self._uploaded[part] = True
         array: Array = self._resident[views]
         return array
+
+    def tabulated(self, stream: Stream, numbers: PerView, stage: str) -> NDArray[np.float64]:
+        """Return numbers of each view, (views, ...); all radiographs are read.
+
+        Parameters
+        ----------
+        stream : Stream
+            Memory budget, and whom to tell how far it is.
+        numbers : callable
+            Gives them for some views. Picklable: others may do it.
+        stage : str
+            What progress reports call this.
+        """
+        rows, views = [], self.shape[0]
+        for chunk in stream.chunks(views, self.view_bytes):
+            stream.report(stage, chunk.start, views)
+            rows.append(numbers(self.read(chunk), chunk))
+        stream.report(stage, views, views)
+        return np.concatenate(rows)
 
     def __getitem__(self, views: slice) -> Floats:
         """Radiographs as the projections of a scan."""

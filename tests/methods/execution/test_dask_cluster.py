@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import clra
-from clra.app.simulation import paper_like, sample, simulated_scan
 from clra.errors import Cancelled, ClusterError
 from clra.methods.execution import worker_facts, worker_process
 from clra.methods.execution.dask_cluster import DaskCluster
@@ -22,48 +21,6 @@ distributed = pytest.importorskip("distributed")
 VOLUME, VOXEL = 3e-6, 2e-4
 # Motions of an alignment, after two levels [pixel].
 MOTION = 1e-4
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dask")
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            memory_limit=None,
-            dashboard_address=":0",
-            silence_logs=50,
-            local_directory=str(folder),
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
-
-
-@pytest.fixture(autouse=True)
-def _own_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-def scan_file(path, kind, views, size=64):
-    geometry = paper_like(kind, views, (size, size))
-    random = np.random.default_rng(3)
-    truth = clra.Motion(
-        shift_u=random.normal(0, 1, views),
-        shift_v=random.normal(0, 1, views),
-        magnification=np.ones(views),
-    )
-    clra.write_scan(path, simulated_scan(geometry, sample("spheres", geometry), truth, name=kind))
-    return clra.read_scan(path)
-
-
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scans")
-    # As few views a turn as Katsevich's method takes.
-    views = {"helix": 320, "space-filling": 160}
-    return {kind: scan_file(folder / f"{kind}.nxs", kind, n) for kind, n in views.items()}
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +117,6 @@ def test_radiographs_in_memory_are_refused(client, scans):
     ("call", "expected"),
     [
         (lambda scan, on: clra.reconstruct(scan, "imgr", cluster=on), "found 'imgr'"),
-        (lambda scan, on: clra.align(scan, estimate="rigid", cluster=on), "found 'rigid'"),
         (lambda scan, on: clra.align(scan, cluster="node1"), "expected ADDRESS"),
         (lambda scan, on: clra.align(scan, cluster=3), "expected a distributed"),
     ],
@@ -264,6 +220,30 @@ def test_a_worker_without_a_device_gets_no_tasks(client, monkeypatch, tmp_path):
     finally:
         executor.close()
     assert (executor.places, set(names)) == (1, {0})
+
+
+def test_a_task_takes_the_gpu_that_its_worker_was_started_with(tmp_path):
+    """Workers of several threads do not pile tasks up, which wait for one device."""
+
+    def running(stream, item):
+        worker = distributed.get_worker()
+        return worker.state.executing_count, dict(worker.state.available_resources)
+
+    with (
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=4,
+            resources={"GPU": 1},
+            memory_limit=None,
+            dashboard_address=":0",
+            local_directory=str(tmp_path / "dask"),
+        ) as local,
+        distributed.Client(local, set_as_default=False) as client,
+    ):
+        executor = DaskCluster(client, tmp_path / "tasks")
+        found = executor.map(running, range(6), stage="s")
+        executor.close()
+    assert found == 6 * [(1, {"GPU": 0})]
 
 
 def test_a_scan_travels_as_paths(scans, tmp_path):

@@ -4,11 +4,9 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 import clra
-from clra.errors import DeviceError
 from clra.methods.execution.executor import reconstruct_planes
 from clra.methods.execution.several_devices import SeveralDevices
 from clra.ops.runtime.devices import choose_device
@@ -33,7 +31,7 @@ run = several_devices._Worker.run
 
 
 def watched(self, *rest):
-    worked.add(self._stream.device.int_ptr)
+    worked.add(self.stream.device.int_ptr)
     run(self, *rest)
 
 
@@ -47,6 +45,10 @@ for method in ("fbp", "katsevich"):
     progress = [p for p in progress if p.stage == progress[-1].stage]
     assert [p.done for p in progress] == sorted(p.done for p in progress)
     assert progress[-1].done == progress[-1].total
+shared = clra.align(scan, schedule="1QR-1HR", device="all", quality=False)
+alone = clra.align(scan, schedule="1QR-1HR", quality=False)
+for one, other in zip(shared.motion.columns(), alone.motion.columns()):
+    assert abs(one - other).max() < 1e-4
 assert worked == {device.int_ptr for device in devices}
 print("shared by", len(worked))
 """
@@ -63,16 +65,17 @@ def test_two_devices_share_the_work():
     assert done.stdout.strip() == "shared by 2"
 
 
-def test_the_first_failure_is_told():
+def test_the_first_failure_is_told(tmp_path):
     def work(stream, planes, target):
         raise ValueError(f"plane {planes.start}")
 
     device = choose_device()
     with pytest.raises(ValueError, match="plane"):
-        reconstruct_planes(SeveralDevices([device, device]), work, (7, 1, 1), None, stage="s")
+        several = SeveralDevices([device, device], tmp_path)
+        reconstruct_planes(several, work, (7, 1, 1), None, stage="s")
 
 
-def test_every_plane_is_taken_once():
+def test_every_plane_is_taken_once(tmp_path):
     taken = []
 
     class Target:
@@ -84,14 +87,26 @@ def test_every_plane_is_taken_once():
             target.write(plane, [None])
 
     device = choose_device()
-    executor = SeveralDevices([device, device, device])
+    executor = SeveralDevices([device, device, device], tmp_path)
     reconstruct_planes(executor, work, (23, 1, 1), Target(), stage="s")
     assert sorted(taken) == [(plane, 1) for plane in range(23)]
 
 
-def test_alignment_takes_one_device():
-    geometry = clra.circular(
-        4, source_to_axis=50.0, source_to_detector=100.0, pixel_size=1.0, shape=(64, 64)
-    )
-    with pytest.raises(DeviceError, match="no OpenCL device 'all'"):
-        clra.align(clra.Scan(np.zeros((4, 64, 64), np.float32), geometry), device="all")
+def test_findings_of_all_devices_are_told(tmp_path):
+    def task(stream, item):
+        clra.Finding("test", f"told by task {item}").warn()
+
+    device = choose_device()
+    executor = SeveralDevices([device, device], tmp_path)
+    with pytest.warns(clra.ClraWarning) as told:
+        executor.map(task, range(5), stage="s")
+    assert {str(warning.message) for warning in told} == {f"told by task {n}" for n in range(5)}
+    assert all(warning.filename == __file__ for warning in told)
+
+
+def test_what_tasks_leave_is_removed(tmp_path):
+    folder = tmp_path / "tasks"
+    executor = SeveralDevices([choose_device()], folder)
+    executor.new_folder("volume").joinpath("slab").touch()
+    executor.close()
+    assert not folder.exists()

@@ -206,6 +206,39 @@ def test_slabs_and_chunks_change_nothing():
     assert np.abs(volume.to_host() - whole).max() < 1e-5 * np.abs(whole).max()
 
 
+@pytest.mark.parametrize("circle", [True, False])
+@pytest.mark.parametrize("trajectory", ["helix", "space-filling"])
+def test_a_slab_takes_the_rows_that_it_needs(trajectory, circle, monkeypatch):
+    scan, _ = _scan(trajectory)
+    grid = VolumeGrid(shape=(61, 40, 38), voxel_size=1.5 * VOXEL, centre=(0.01, -0.02, 0.1))
+    read = []
+
+    class Kept:
+        shape = scan.shape
+
+        def read(self, start, stop, rows=None):
+            part = scan.read(start, stop)
+            part = part if rows is None else np.ascontiguousarray(part[:, rows])
+            read.append(part.size)
+            return part
+
+    def dirty(stream, shape):
+        array = empty(stream, shape)
+        array.fill(np.float32(np.nan), queue=stream.queue)
+        return array
+
+    empty = Stream.empty
+    monkeypatch.setattr(Stream, "empty", dirty)
+    radiographs = Radiographs.of(Kept(), 1)
+    options = {"circle": circle, "extend": 0.0}
+    stream, planes = Stream(), slice(12, 18)
+    part = ramp_fbp(stream, radiographs, scan.geometry, grid, planes=planes, **options)
+    assert sum(read) < 0.6 * np.prod(scan.shape)
+    whole = ramp_fbp(stream, radiographs, scan.geometry, grid, **options).to_host()
+    assert np.abs(part.to_host() - whole[planes]).max() < 1e-5 * np.abs(whole).max()
+    assert (whole[planes] != 0).mean() > 0.5
+
+
 # Of what merely leaving views out changes in a volume blurred by a voxel: on a helix those beside
 # look from 4 degrees aside, on the other from 12 and more.
 @pytest.mark.parametrize(("trajectory", "part"), [("helix", 0.3), ("space-filling", 0.65)])

@@ -198,6 +198,22 @@ def test_any_chunk_gives_the_same(context, queue, form):
     np.testing.assert_array_equal(whole.get(), expected)
 
 
+@pytest.mark.parametrize("form", [CPU, GPU], ids=["cpu", "gpu"], indirect=True)
+def test_rows_are_filtered_alone(context, queue, form):
+    geometry = scanner(views=5, shape=(11, 37))
+    image = image_of(geometry)
+    weights = {"row_weight": np.linspace(0.5, 1, 11)}
+    expected = run(context, queue, geometry, image, **weights)
+    ramp_filter = RampFilter(context, geometry, **weights)
+    views, rows = slice(1, 4), slice(4, 9)  # GPUs filter pairs of rows
+    out = cl_array.to_device(queue, np.full((3, 11, 37), np.nan, np.float32))
+    part = cl_array.to_device(queue, np.ascontiguousarray(image[views, rows]))
+    ramp_filter(queue, out, part, views=views, rows=rows)
+    found = out.get()
+    np.testing.assert_array_equal(found[:, rows], expected[views, rows])
+    assert np.isnan(np.delete(found, np.r_[rows], axis=1)).all()
+
+
 def test_length_unit_does_not_matter(context, queue):
     geometry = scanner()
     image = image_of(geometry)

@@ -1,11 +1,13 @@
 """The column of the axis of an arc, where an alignment begins."""
 
 import math
+from collections.abc import Callable
 
 from clra.errors import InputError
 from clra.methods.assessment.axis_of_arc import axis_offset
 from clra.model.sampling.angular_coverage import covered, is_circle
 from clra.model.scan import Scan
+from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 # Smallest offset that counts [pixel], and how much better the rays of a line have to agree: jitter
@@ -13,7 +15,7 @@ from clra.ops.streaming.stream import Stream
 _LEAST, _BETTER = 1.5, 1.5
 
 
-def axis_column(stream: Stream, scan: Scan) -> float:
+def axis_column(stream: Stream, scan: Scan, radiographs: Callable[[], Radiographs]) -> float:
     """Return how far the axis is seen from where the geometry has it, if rays tell.
 
     On less than a turn a shift of all views resembles a movement of the sample across the beam,
@@ -26,7 +28,9 @@ def axis_column(stream: Stream, scan: Scan) -> float:
     stream : Stream
         Memory budget, and whom to tell how far it is.
     scan : Scan
-        Of any trajectory; a few rows of all views are read if it is an arc.
+        Of any trajectory.
+    radiographs : callable
+        Returns those of the scan, all of which are read if it is an arc.
 
     Returns
     -------
@@ -36,7 +40,7 @@ def axis_column(stream: Stream, scan: Scan) -> float:
     if not is_circle(scan.geometry) or covered(scan.geometry) == 2 * math.pi:
         return 0.0
     try:
-        offset, gain = axis_offset(stream, scan)
+        offset, gain = axis_offset(stream, scan, radiographs())
     except InputError:
         return 0.0
     return offset if abs(offset) >= _LEAST and gain >= _BETTER else 0.0

@@ -7,6 +7,7 @@ degrees: there they are where the iteration starts, and only if the motion is la
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +27,6 @@ from clra.model.gauge.gauge import Gauge
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered, fan_angle
-from clra.model.scan import Scan
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
@@ -142,7 +142,12 @@ def is_open(schedule: str, start: Motion) -> bool:
 
 
 def prealigned(
-    stream: Stream, scan: Scan, coarsest: int, rejections: Rejections, gauge: Gauge
+    stream: Stream,
+    geometry: ConeBeamGeometry,
+    binned: Callable[[int], Radiographs],
+    coarsest: int,
+    rejections: Rejections,
+    gauge: Gauge,
 ) -> Prealignment | None:
     """Find shifts by sums over the radiographs, where they are of use.
 
@@ -150,8 +155,10 @@ def prealigned(
     ----------
     stream : Stream
         Memory budget, and whom to tell how far it is.
-    scan : Scan
-        All its radiographs are read.
+    geometry : ConeBeamGeometry
+        Of the scan at full resolution.
+    binned : callable
+        Returns its radiographs for a binning factor; all are read.
     coarsest : int
         Binning of the first iteration.
     rejections : Rejections
@@ -167,8 +174,7 @@ def prealigned(
         or more, the detector's columns are not along the axis, or the motion is neither large nor
         on an arc of a parallel beam.
     """
-    geometry = scan.geometry
-    radiographs = Radiographs(stream, scan, _level(geometry, coarsest))
+    radiographs = binned(_level(geometry, coarsest))
     valid_views = ~rejections.first(stream, radiographs)
     axis = _axis(geometry.binned(radiographs.level))
     if axis is None or valid_views.sum() < 2:

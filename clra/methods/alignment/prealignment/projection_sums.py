@@ -79,11 +79,8 @@ def projection_sums(
     ProjectionSums or None
         None if no more than half of the views show the sample between both borders.
     """
-    views, _, columns = radiographs.shape
-    profiles = np.empty((views, columns))
-    for chunk in stream.chunks(views, radiographs.view_bytes):
-        stream.report("pre-alignment: reading", chunk.start, views)
-        profiles[chunk] = radiographs.read(chunk).mean(axis=1, dtype=np.float64)
+    columns = radiographs.shape[2]
+    profiles = radiographs.tabulated(stream, _profiles, "pre-alignment: reading")
     left, right = profiles[:, :_BORDER].mean(axis=1), profiles[:, -_BORDER:].mean(axis=1)
     at_border = np.maximum(left, right)
     level = float(np.median(profiles[valid_views].max(axis=1)))
@@ -95,20 +92,36 @@ def projection_sums(
     air = np.linspace(first, last, columns)
     profiles -= air
     centre, half_width = _window(profiles, inside)
-    place = np.arange(columns) - centre[:, None]
-    # Its ends move by parts of a pixel.
-    weight = np.clip(half_width + 0.5 - np.abs(place), 0, 1)
-    mass, moment = np.empty((2, *radiographs.shape[:2]))
-    for chunk in stream.chunks(views, radiographs.view_bytes):
-        stream.report("pre-alignment: summing", chunk.start, views)
-        images = radiographs.read(chunk) - air
-        mass[chunk] = np.einsum("vrc,vc->vr", images, weight[chunk])
-        moment[chunk] = np.einsum("vrc,vc->vr", images, (weight * place)[chunk])
+    sums = radiographs.tabulated(
+        stream, _RowSums(air, centre, half_width), "pre-alignment: summing"
+    )
+    mass, moment = (np.ascontiguousarray(sums[:, k]) for k in (0, 1))
     within = (centre >= half_width) & (centre <= columns - 1 - half_width)
     whole = inside & within
     if 2 * whole.sum() <= valid_views.sum():
         return None
     return ProjectionSums(profiles, mass, moment, centre, half_width, whole)
+
+
+def _profiles(images: NDArray[np.float32], views: slice) -> Floats:
+    return np.asarray(images.mean(axis=1, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class _RowSums:
+    """Sums up the rows of some views within their windows: mass and moment, (n, 2, rows)."""
+
+    air: Floats
+    centre: Floats
+    half_width: float
+
+    def __call__(self, images: NDArray[np.float32], views: slice) -> Floats:
+        place = np.arange(images.shape[2]) - self.centre[views, None]
+        # Its ends move by parts of a pixel.
+        weight = np.clip(self.half_width + 0.5 - np.abs(place), 0, 1)
+        above_air = images - self.air
+        moments = (np.einsum("vrc,vc->vr", above_air, w) for w in (weight, weight * place))
+        return np.stack(list(moments), axis=1)
 
 
 def _window(profiles: Floats, inside: NDArray[np.bool_]) -> tuple[Floats, float]:

@@ -6,16 +6,23 @@ re-projection.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clra.errors import Cancelled
+from clra.findings import Finding
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import Region
 from clra.methods.alignment.rejected_views import outliers
-from clra.methods.alignment.result import AlignmentResult, Iteration, finished
+from clra.methods.alignment.result import (
+    AlignmentInterrupted,
+    AlignmentResult,
+    Iteration,
+    finished,
+)
 from clra.methods.alignment.rigid.observability import held
 from clra.methods.alignment.rigid.rigid_level import RigidLevel
 from clra.methods.alignment.rigid.rigid_state import RigidState
@@ -77,6 +84,8 @@ class RigidAlignment:
         Keeps each finished iteration.
     shifts : (dict, dict), optional
         By which the alignment of the shifts goes on, kept beside it.
+    make_level : callable
+        Makes a :class:`RigidLevel` of its first seven arguments.
     """
 
     stream: Stream
@@ -88,6 +97,7 @@ class RigidAlignment:
     anchor: bool
     checkpoint: Checkpoint | None = None
     shifts: State = field(default_factory=lambda: ({}, {}))
+    make_level: Callable[..., RigidLevel] = RigidLevel
     done: RigidState = field(init=False)
 
     def __post_init__(self) -> None:
@@ -98,7 +108,7 @@ class RigidAlignment:
     def align(
         self, saved: Saved | None = None, stages: Sequence[tuple[int, int]] | None = None
     ) -> AlignmentResult:
-        """Go through the resolutions, or what is left of them.
+        """Go through the resolutions, or what is left of them; what is finished stays if it ends.
 
         Parameters
         ----------
@@ -106,10 +116,24 @@ class RigidAlignment:
             What a checkpoint holds, of this alignment or of the shifts alone.
         stages : sequence of (int, int), optional
             Binnings and numbers of iterations; those of `rigid_stages` by default.
+
+        Raises
+        ------
+        AlignmentInterrupted
+            On Ctrl-C; carries the result so far.
         """
+        try:
+            self._align(saved, stages or rigid_stages(self.scan.geometry.shape))
+        except Cancelled:
+            done = finished(self.done.history)
+            Finding("cancelled", f"the alignment was ended early, after {done}").warn()
+        except KeyboardInterrupt:
+            raise AlignmentInterrupted(self.result()) from None
+        return self.result()
+
+    def _align(self, saved: Saved | None, stages: Sequence[tuple[int, int]]) -> None:
         self.done = (saved and RigidState.kept(saved)) or self.done
         first, begun = self.done.position
-        stages = stages or rigid_stages(self.scan.geometry.shape)
         for index, (factor, iterations) in enumerate(stages):
             if index > first:
                 self.done = replace(self.done, bias=None, slow=type(self.done.slow)())
@@ -121,7 +145,6 @@ class RigidAlignment:
         alone = self._of_slow_modes_too(self.done.last.alone)
         free = FREE[self.estimate]
         self.done.motion = held(self.done.motion, alone, ~self.done.rejected, free)
-        return self.result()
 
     def _align_level(self, factor: int, iterations: int, index: int, begun: int) -> None:
         voxel = self.region.grid.voxel_size
@@ -129,7 +152,9 @@ class RigidAlignment:
         free = FREE[self.estimate]
         # What lies beside the circle that all views see is projected as well, if there is anything.
         solver = replace(self.solver, circle=self.solver.circle and not self.region.truncated)
-        level = RigidLevel(self.stream, self.scan, self.region.grid, solver, factor, free, prior)
+        level = self.make_level(
+            self.stream, self.scan, self.region.grid, solver, factor, free, prior
+        )
         level.bias = self.done.bias
         for iteration in range(begun + 1, iterations + 1):
             started, before = time.perf_counter(), self.done

@@ -1,13 +1,14 @@
 """One resolution of a rigid alignment: reconstruct, project, and solve for six numbers a view."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reprojection import binned_mask, used_pixels
-from clra.methods.alignment.rigid.rigid_solution import RigidStep, solve
+from clra.methods.alignment.rigid.rigid_solution import RigidStep, equations, solve
 from clra.methods.reconstruction.fitted_fbp import fitted_fbp, reprojections
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
@@ -64,7 +65,7 @@ class RigidLevel:
     bias: Floats | None = field(init=False, default=None)  # what is found where nothing moved
 
     def __post_init__(self) -> None:
-        self.radiographs = Radiographs(self.stream, self.scan, self.factor)
+        self.radiographs = self._binned()
         if self.factor > 1:
             self.grid = self.grid.binned(self.factor)
 
@@ -89,19 +90,26 @@ class RigidLevel:
         found = self.registered(self.radiographs, volume, geometry, title)
         if measure and self.bias is None and self.solver.unbias:
             doing = f"{title}, of what is simulated"
-            still = reprojections(self.stream, volume, geometry, self.factor, doing)
+            still = self._simulated(volume, geometry, doing)
             del volume
             again = self.reconstructed(still, geometry, valid_views, doing)
             self.bias = self.registered(still, again, geometry, doing).table
         return found if self.bias is None else found.less(self.bias)
 
+    def registered(
+        self, radiographs: Any, volume: Any, geometry: ConeBeamGeometry, title: str
+    ) -> RigidStep:
+        """Return what displaces radiographs against re-projections of a volume, view by view."""
+        rows = self._equations(radiographs, volume, geometry, f"{title}: registering")
+        return solve(rows, self.free, self.prior)
+
     def reconstructed(
         self,
-        radiographs: Radiographs,
+        radiographs: Any,
         geometry: ConeBeamGeometry,
         valid_views: NDArray[np.bool_],
         title: str,
-    ) -> Volume:
+    ) -> Any:
         """Return a volume of radiographs whose geometry has absorbed the motion."""
         return fitted_fbp(
             self.stream,
@@ -113,39 +121,82 @@ class RigidLevel:
             valid_views=valid_views,
             circle=self.solver.circle,
             used=used_pixels(self.scan, self.factor),
-            stage=f"{title}: reconstructing",
+            stage=title,
         )
 
-    def registered(
-        self, radiographs: Radiographs, volume: Volume, geometry: ConeBeamGeometry, title: str
-    ) -> RigidStep:
-        """Return what displaces radiographs against re-projections of a volume, view by view."""
-        stream, mask = self.stream, self.scan.registration_mask
-        views, rows, columns = radiographs.shape
-        # The registration keeps eight images of a view twice.
-        chunks = stream.chunks(views, 2 * IMAGES * radiographs.view_bytes)
-        register = RigidRegistration(
-            stream.context,
-            (rows, columns),
-            views=max(chunk.stop - chunk.start for chunk in chunks),
-            low_pass=_BAND[0],
-            high_pass=_BAND[1],
-            mask=None if mask is None else binned_mask(mask, self.factor),
-            allocator=stream.memory,
+    def _binned(self) -> Radiographs:
+        return Radiographs(self.stream, self.scan, self.factor)
+
+    def _simulated(self, volume: Any, geometry: ConeBeamGeometry, stage: str) -> Radiographs:
+        return reprojections(self.stream, volume, geometry, self.factor, stage)
+
+    def _equations(
+        self, radiographs: Any, volume: Any, geometry: ConeBeamGeometry, stage: str
+    ) -> Floats:
+        return rigid_equations(
+            self.stream, self.scan, radiographs, volume, geometry, self.free, stage
         )
-        project = SlabMoments(stream, volume, geometry)
-        table = rigid_table(geometry)
-        totals = np.empty((views, register.blocks, PRODUCTS))
-        for chunk in chunks:
-            stream.report(f"{title}: registering", chunk.start, views)
-            count = chunk.stop - chunk.start
-            measured = stream.upload(radiographs.read(chunk))
-            simulated, over_depth = (stream.empty((count, rows, columns)) for _ in range(2))
-            project.moments(simulated, over_depth, chunk)
-            out = stream.empty((count, register.blocks, PRODUCTS))
-            numbers = stream.upload(table[chunk])
-            register(stream.queue, out, measured, simulated, over_depth, numbers)
-            totals[chunk] = stream.download(out)
-            del measured, simulated, over_depth, numbers, out
-        stream.report(f"{title}: registering", views, views)
-        return solve(totals, self.free, self.prior, register.total_weight, register.low_pass)
+
+
+def rigid_equations(
+    stream: Stream,
+    scan: Scan,
+    radiographs: Radiographs,
+    volume: Volume,
+    geometry: ConeBeamGeometry,
+    free: tuple[int, ...],
+    stage: str,
+) -> Floats:
+    """Return the normal equations of each view against re-projections of a volume.
+
+    Parameters
+    ----------
+    stream : Stream
+        Device and memory budget.
+    scan : Scan
+        At full resolution, with its mask.
+    radiographs : Radiographs
+        Measured line integrals at the resolution of `geometry`.
+    volume : Volume
+        Reconstruction.
+    geometry : ConeBeamGeometry
+        Of the radiographs, with the motion known so far absorbed.
+    free : tuple of int
+        Parameters to estimate.
+    stage : str
+        What progress reports call this.
+
+    Returns
+    -------
+    ndarray, (views, numbers)
+        See :func:`clra.methods.alignment.rigid.rigid_solution.equations`.
+    """
+    mask = scan.registration_mask
+    views, rows, columns = radiographs.shape
+    # The registration keeps eight images of a view twice.
+    chunks = stream.chunks(views, 2 * IMAGES * radiographs.view_bytes)
+    register = RigidRegistration(
+        stream.context,
+        (rows, columns),
+        views=max(chunk.stop - chunk.start for chunk in chunks),
+        low_pass=_BAND[0],
+        high_pass=_BAND[1],
+        mask=None if mask is None else binned_mask(mask, radiographs.level),
+        allocator=stream.memory,
+    )
+    project = SlabMoments(stream, volume, geometry)
+    table, found = rigid_table(geometry), []
+    for chunk in chunks:
+        stream.report(stage, chunk.start, views)
+        count = chunk.stop - chunk.start
+        measured = stream.upload(radiographs.read(chunk))
+        simulated, over_depth = (stream.empty((count, rows, columns)) for _ in range(2))
+        project.moments(simulated, over_depth, chunk)
+        out = stream.empty((count, register.blocks, PRODUCTS))
+        numbers = stream.upload(table[chunk])
+        register(stream.queue, out, measured, simulated, over_depth, numbers)
+        totals = stream.download(out).astype(np.float64)
+        found.append(equations(totals, free, register.total_weight, register.low_pass))
+        del measured, simulated, over_depth, numbers, out
+    stream.report(stage, views, views)
+    return np.concatenate(found)

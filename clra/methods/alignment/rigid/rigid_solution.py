@@ -1,11 +1,14 @@
-"""Normal equations of rigid motion, solved view by view."""
+"""Normal equations of rigid motion, solved view by view.
+
+All that views have in common is how much their noise is enlarged: their median.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.ops.registration.rigid_registration import IMAGES
+from clra.ops.registration.rigid_registration import IMAGES, PRODUCTS
 
 Floats = NDArray[np.float64]
 
@@ -50,10 +53,8 @@ class RigidStep:
         return replace(self, table=self.table - bias)
 
 
-def solve(
-    totals: Floats, free: tuple[int, ...], prior: Floats, weight: float, low_pass: float
-) -> RigidStep:
-    """Solve the normal equations.
+def equations(totals: Floats, free: tuple[int, ...], weight: float, low_pass: float) -> Floats:
+    """Sum normal equations up, and how much bands of rows differ in what they ask for.
 
     Parameters
     ----------
@@ -61,58 +62,98 @@ def solve(
         As `clra.ops.registration.rigid_registration.RigidRegistration` gives them.
     free : tuple of int
         Parameters to estimate; a gain is always fitted.
-    prior : ndarray, (6,)
-        Expected standard deviation of each step; 0 for unknown.
     weight : float
         Sum of the weights of the pixels.
     low_pass : float
         Sigma of the band-pass that the images are behind [pixel].
+
+    Returns
+    -------
+    ndarray, (views, 36 + 2 + parameters + 1)
+        A row a view: totals of all blocks, `weight`, the variance of the noise, and for each
+        parameter and the gain the variance among blocks, in those that the noise makes.
     """
     correlated = max(1.0, _IN_BAND * 4 * np.pi * low_pass**2)  # pixels that count as one sample
-    views, blocks, count = *totals.shape[:2], len(free)
-    bands = np.empty((views, blocks, IMAGES, IMAGES))
-    upper = np.triu_indices(IMAGES)
-    bands[..., upper[0], upper[1]] = bands[..., upper[1], upper[0]] = totals
-    gram = bands.sum(axis=1)
-    unknown = [*free, _GAIN]
-    # Of one length each, or millimetres and radians differ by orders of magnitude.
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", gram)[:, unknown], 1e-300))
-    normal = gram[:, unknown][:, :, unknown] / scale[:, :, None] / scale[:, None, :]
-    right = gram[:, unknown, _DIFFERENCE] / scale
-    square = gram[:, _DIFFERENCE, _DIFFERENCE]
-    ridge = _RIDGE * np.eye(count + 1)
-
-    def variance(x: Floats) -> Floats:
-        left = square - 2 * np.sum(x * right, axis=1) + np.einsum("ni,nij,nj->n", x, normal, x)
-        return np.asarray(np.maximum(left, 1e-12 * square) / weight)
-
-    whole = np.linalg.inv(normal + ridge)
-    plain = np.einsum("nij,nj->ni", whole, right)
-    noise = correlated * variance(plain)
-    grown = np.ones(count + 1)
-    if blocks >= _FEW:
-        rows = bands[:, :, unknown] / scale[:, None, :, None]
+    products = totals.sum(axis=1)
+    system = _System(products, free)
+    plain = np.einsum("nij,nj->ni", system.inverse, system.right)
+    noise = correlated * system.variance(plain, weight)
+    scatter = np.zeros_like(plain)
+    if totals.shape[1] >= _FEW:
+        unknown = [*free, _GAIN]
+        rows = _symmetric(totals)[:, :, unknown] / system.scale[:, None, :, None]
         asked = rows[..., _DIFFERENCE] - np.einsum(
-            "nbij,nj->nbi", rows[..., unknown], plain / scale
+            "nbij,nj->nbi", rows[..., unknown], plain / system.scale
         )
-        by_noise = np.maximum(noise[:, None] * np.einsum("nii->ni", whole), 1e-300)
-        grown = np.maximum(1.0, _STAYS * np.median(_scatter(asked, whole) / by_noise, axis=0))
+        by_noise = noise[:, None] * np.einsum("nii->ni", system.inverse)
+        scatter = _scatter(asked, system.inverse) / np.maximum(by_noise, 1e-300)
+    return np.column_stack([products, np.full(len(noise), weight), noise, scatter])
+
+
+def solve(rows: Floats, free: tuple[int, ...], prior: Floats) -> RigidStep:
+    """Solve the normal equations.
+
+    Parameters
+    ----------
+    rows : ndarray, (views, 36 + 2 + parameters + 1)
+        Of all views, as :func:`equations` gives them.
+    free : tuple of int
+        Parameters to estimate.
+    prior : ndarray, (6,)
+        Expected standard deviation of each step; 0 for unknown.
+    """
+    products, (weight, noise) = rows[:, :PRODUCTS], rows[:, PRODUCTS : PRODUCTS + 2].T
+    scatter = rows[:, PRODUCTS + 2 :]
+    views, count = len(rows), len(free)
+    system = _System(products, free)
+    scale, square = system.scale, system.square
+    grown = np.maximum(1.0, _STAYS * np.median(scatter, axis=0))
     known = np.zeros((views, count + 1))
     some = np.append(prior[list(free)] > 0, False)
     known[:, some] = noise[:, None] * grown[some] / prior[list(free)][some[:-1]] ** 2
-    held = normal + ridge + np.einsum("ni,ij->nij", known / scale**2, np.eye(count + 1))
+    held = system.normal + np.einsum("ni,ij->nij", known / scale**2, np.eye(count + 1))
     inverse = np.linalg.inv(held)
-    x = np.einsum("nij,nj->ni", inverse, right)
+    x = np.einsum("nij,nj->ni", inverse, system.right)
     table, sigma, alone = np.zeros((views, 6)), *np.full((2, views, 6), np.nan)
     table[:, list(free)] = (x / scale)[:, :count]
-    for errors, covariance in ((sigma, inverse), (alone, whole)):
+    for errors, covariance in ((sigma, inverse), (alone, system.inverse)):
         spread = np.sqrt(noise[:, None] * grown * np.einsum("nii->ni", covariance)) / scale
         errors[:, list(free)] = spread[:, :count]
-    own = gram[:, _GAIN, _GAIN]
-    crossed = own + gram[:, _GAIN, _DIFFERENCE]
-    measured = own + 2 * gram[:, _GAIN, _DIFFERENCE] + square
-    correlation = crossed / np.sqrt(np.maximum(own * measured, 1e-300))
-    return RigidStep(table, sigma, alone, correlation, np.sqrt(variance(x)))
+    own, with_difference = (system.gram[:, _GAIN, k] for k in (_GAIN, _DIFFERENCE))
+    measured = own + 2 * with_difference + square
+    correlation = (own + with_difference) / np.sqrt(np.maximum(own * measured, 1e-300))
+    return RigidStep(table, sigma, alone, correlation, np.sqrt(system.variance(x, weight)))
+
+
+class _System:
+    """Normal equations of each view in units in which the unknowns have one length."""
+
+    def __init__(self, products: Floats, free: tuple[int, ...]) -> None:
+        unknown = [*free, _GAIN]
+        self.gram = _symmetric(products)
+        # Millimetres and radians differ by orders of magnitude.
+        own = np.einsum("nii->ni", self.gram)[:, unknown]
+        self.scale = np.sqrt(np.maximum(own, 1e-300))
+        normal = self.gram[:, unknown][:, :, unknown]
+        self._plain = normal / self.scale[:, :, None] / self.scale[:, None, :]
+        self.normal = self._plain + _RIDGE * np.eye(len(unknown))
+        self.right = self.gram[:, unknown, _DIFFERENCE] / self.scale
+        self.square = self.gram[:, _DIFFERENCE, _DIFFERENCE]
+        self.inverse = np.linalg.inv(self.normal)
+
+    def variance(self, x: Floats, weight: float | Floats) -> Floats:
+        """Mean square of what a solution leaves of the difference."""
+        explained = 2 * np.sum(x * self.right, axis=1)
+        left = self.square - explained + np.einsum("ni,nij,nj->n", x, self._plain, x)
+        return np.asarray(np.maximum(left, 1e-12 * self.square) / weight)
+
+
+def _symmetric(products: Floats) -> Floats:
+    """Return matrices (..., 8, 8) of their upper triangles."""
+    whole = np.empty((*products.shape[:-1], IMAGES, IMAGES))
+    upper = np.triu_indices(IMAGES)
+    whole[..., upper[0], upper[1]] = whole[..., upper[1], upper[0]] = products
+    return whole
 
 
 def _scatter(asked: Floats, inverse: Floats) -> Floats:

@@ -10,6 +10,7 @@ from clra.methods.alignment.prealignment.axis_column import axis_column
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 
 VIEWS, ASIDE = 60, 5.0
@@ -40,7 +41,9 @@ def _scan(arc, aside, jitter=0.0):
     [(210, ASIDE, ASIDE), (210, -ASIDE, -ASIDE), (210, 0.5, 0), (360, ASIDE, 0), (120, ASIDE, 0)],
 )
 def test_an_axis_aside_is_found_where_rays_are_measured_twice(arc, aside, found):
-    assert axis_column(Stream(), _scan(arc, aside)) == pytest.approx(found, abs=0.3)
+    stream, scan = Stream(), _scan(arc, aside)
+    column = axis_column(stream, scan, lambda: Radiographs(stream, scan, 1))
+    assert column == pytest.approx(found, abs=0.3)
 
 
 def test_an_axis_aside_is_no_movement_of_the_sample():

@@ -1,6 +1,7 @@
 """Pre-alignment of scans whose radiographs are closed forms."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from clra.methods.alignment.result import PREALIGNED
 from clra.model.gauge.gauge import Gauge, sample_points
 from clra.model.grid import default_grid
 from clra.model.phantoms.ellipsoids import Ellipsoids
+from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
 from clra.progress import Progress
 
@@ -70,7 +72,9 @@ def _gauge(geometry):
 
 
 def _found(scan):
-    return prealigned(Stream(), scan, 4, Rejections(scan.views), _gauge(scan.geometry))
+    stream, geometry = Stream(), scan.geometry
+    binned = partial(Radiographs, stream, scan)
+    return prealigned(stream, geometry, binned, 4, Rejections(scan.views), _gauge(geometry))
 
 
 def _errors(geometry, found, truth):

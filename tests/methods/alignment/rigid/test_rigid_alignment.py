@@ -11,7 +11,7 @@ from clra.errors import Cancelled, InputError
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.result import AlignmentInterrupted
 from clra.methods.alignment.rigid.rigid_level import RigidLevel
-from clra.methods.alignment.rigid.rigid_solution import solve
+from clra.methods.alignment.rigid.rigid_solution import equations, solve
 from clra.methods.execution.checkpoint import Checkpoint
 from clra.model.grid import default_grid
 from clra.model.rigid.rigid_gauge import between, without_rigid_gauge
@@ -88,6 +88,10 @@ def test_the_shifts_stay_if_it_is_ended_while_it_looks_for_rotations(scan, error
     assert kept.motion.cause == "detector" and np.abs(kept.motion.shift_u).max() > 0.5
 
 
+def solved(totals, free, prior):
+    return solve(equations(totals, free, 400.0, 0.0), free, prior)
+
+
 def test_normal_equations_are_solved_view_by_view():
     random = np.random.default_rng(5)
     images = random.normal(size=(3, 8, 400))
@@ -95,10 +99,10 @@ def test_normal_equations_are_solved_view_by_view():
     images[:, 7] = np.einsum("nk,nkp->np", true, images[:, :7]) + 0.01 * images[:, 7]
     gram = np.einsum("nip,njp->nij", images, images)
     totals = np.stack([one[np.triu_indices(8)] for one in gram])[:, None]
-    found = solve(totals, (0, 1, 2, 3, 4, 5), np.zeros(6), 400.0, 0.0)
+    found = solved(totals, (0, 1, 2, 3, 4, 5), np.zeros(6))
     assert np.abs(found.table - true[:, :6]).max() < 0.004
     assert np.allclose(found.sigma, 0.01 / 20, rtol=0.3)
-    held = solve(totals, (0, 1, 5), np.array([0, 0, 0, 0, 0, 1e-9]), 400.0, 0.0)
+    held = solved(totals, (0, 1, 5), np.array([0, 0, 0, 0, 0, 1e-9]))
     assert np.abs(held.table[:, 5]).max() < 1e-6 and np.isnan(held.sigma[:, 2:5]).all()
 
 
