@@ -11,6 +11,7 @@ from clra.errors import Cancelled
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted
+from clra.methods.alignment.steps import odd_harmonics
 from clra.methods.alignment.steps.odd_harmonics import (
     are_open,
     fitted_harmonics,
@@ -83,6 +84,12 @@ def test_wrong_harmonics_are_found():
 def test_harmonics_that_re_projections_show_are_left_alone():
     scan = _scan(body=False)
     assert not fitted_harmonics(Stream(), scan, _region(scan), _wrong(scan), ALL).any()
+
+
+def test_a_fit_that_gains_nothing_is_dropped(monkeypatch):
+    monkeypatch.setattr(odd_harmonics, "_SEEN", math.inf)
+    scan, still = _scan(body=False), clra.Motion.identity(VIEWS)
+    assert not fitted_harmonics(Stream(), scan, _region(scan), still, ALL).any()
 
 
 def test_truncated_samples_on_circles_have_open_harmonics(aligned):
