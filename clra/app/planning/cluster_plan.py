@@ -80,7 +80,7 @@ def plans(
     site: Site | None = None,
     aligned: VolumeGrid | None = None,
 ) -> list[Plan]:
-    """Plan a reconstruction at full resolution and an alignment by the default schedule.
+    """Plan reconstructions at full resolution and an alignment by the default schedule.
 
     Parameters
     ----------

@@ -24,6 +24,7 @@ from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.methods.shared_work.shared_level import levels_by
+from clra.methods.shared_work.shared_multigrid_level import multigrid_levels_by
 from clra.methods.shared_work.shared_rigid_level import rigid_levels_by
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
@@ -96,8 +97,8 @@ def align(
     grid : VolumeGrid, optional
         Full-resolution grid that holds the sample; by default the whole field of view.
     device : str or cl.Device, optional
-        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all" to share "ra" out to
-        all devices of the best kind.
+        As :func:`clra.ops.runtime.devices.choose_device` takes it, or "all" to share the work out
+        to all devices of the best kind.
     reference : Scan, optional
         Some views of the scan again, from the same places, taken so quickly that nothing moved.
         What drifted slowly against them is where re-projection alignment starts.
@@ -128,9 +129,9 @@ def align(
         Whether to judge the result by views that are held out: a verdict, and standard errors that
         count what is left. A motion that predicts them no better than the start is not returned.
     cluster : distributed.Client or str, optional
-        Workers that reconstruct, project and register for "ra": a client of Dask, or "local:N",
-        "slurm:N", the address of a scheduler or its file. The scan has to be in a file. What is
-        left for the device here is small.
+        Workers that reconstruct, project and register for "ra" and "imgr": a client of Dask, or
+        "local:N", "slurm:N", the address of a scheduler or its file. The scan has to be in a file.
+        What is left for the device here is small.
 
     Returns
     -------
@@ -155,7 +156,7 @@ def align(
     _check(scan, method, estimate, gauge)
     if estimate == "source" and isinstance(motion, RigidMotion):
         raise InputError("motion: found a rigid one with estimate='source', expected shifts")
-    check_for_cluster(cluster, scan, method, ("ra",))
+    check_for_cluster(cluster, scan, method, ("ra", "imgr"))
     keeping, own = checkpoint_of(checkpoint, resume)
     stages = parse_schedule(schedule, scan.cropped().geometry.shape) if method == "ra" else ()
     for name, given in (("motion", motion), ("truth", truth)):
@@ -165,12 +166,8 @@ def align(
         found = "both" if motion else "none with method='reference'"
         raise InputError(f"reference, motion: found {found}, expected one of them")
     devices = usable_devices(device, progress)
-    stream = Stream(
-        devices[0],
-        max_device_memory=max_device_memory,
-        max_host_memory=max_host_memory,
-        report=progress,
-    )
+    limits = {"max_device_memory": max_device_memory, "max_host_memory": max_host_memory}
+    stream = Stream(devices[0], report=progress, **limits)
     anchor = gauge == "anchored" and method != "reference"
     begun: RigidStart | None = None
 
@@ -225,19 +222,21 @@ def align(
             saved = keeping.begin(identity(part, grid, options, motion=start))
         try:
             if method == "imgr":
-                aligned = _by_imgr(
-                    stream,
-                    part,
-                    grid,
-                    levels=schedule,
-                    align=True,
-                    scale=scale,
-                    anchor=anchor,
-                    motion=start,
-                    truth=truth,
-                    checkpoint=keeping,
-                    saved=saved,
-                )
+                with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+                    aligned = _by_imgr(
+                        stream,
+                        part,
+                        grid,
+                        levels=schedule,
+                        align=True,
+                        scale=scale,
+                        anchor=anchor,
+                        motion=start,
+                        truth=truth,
+                        checkpoint=keeping,
+                        saved=saved,
+                        make_level=multigrid_levels_by(executor, part),
+                    )
             else:
                 region = region_of(stream, part, grid, own=own_grid)
                 run = CoarseToFine(
@@ -252,10 +251,6 @@ def align(
                     truth,
                     keeping,
                 )
-                limits = {
-                    "max_device_memory": max_device_memory,
-                    "max_host_memory": max_host_memory,
-                }
                 with executing(stream, devices, cluster, keeping, progress, limits) as executor:
                     run.make_level = levels_by(executor, part)
                     run.align(stages, saved)

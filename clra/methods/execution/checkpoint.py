@@ -23,7 +23,7 @@ from clra.findings import Finding, collected_so_far
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming.volume import Volume
+from clra.ops.streaming.volume import PlaneSource
 
 _LOG = logging.getLogger(__name__)
 _STATE = "state.json"
@@ -120,7 +120,7 @@ class Checkpoint:
         kept: str,
         values: Mapping[str, Any],
         arrays: Mapping[str, NDArray[Any]],
-        volume: Volume | None = None,
+        volume: PlaneSource | None = None,
     ) -> None:
         """Keep a state in place of the one before; see :class:`Saved` for the parameters."""
         number = self._number + 1
@@ -282,7 +282,7 @@ def fingerprint(*arrays: NDArray[Any]) -> str:
 class _Planes:
     """Takes the planes of a volume into a .npy file."""
 
-    def __init__(self, file: IO[bytes], volume: Volume) -> None:
+    def __init__(self, file: IO[bytes], volume: PlaneSource) -> None:
         shape = volume.grid.shape
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)

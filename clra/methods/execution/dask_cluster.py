@@ -133,6 +133,7 @@ class DaskCluster:
         items: Sequence[Item],
         *,
         stage: str,
+        part: tuple[int, int] | None = (0, 1),
         done: Callable[[int], None] | None = None,
     ) -> list[Result]:
         """Do a task with each of some items.
@@ -151,7 +152,7 @@ class DaskCluster:
             for number in range(len(items)):
                 waiting.add(number)
             while waiting.futures:
-                tell(self._progress, stage, len(results), len(items))
+                self._tell(stage, part, len(results), len(items))
                 ready = waiting.next()
                 if ready is None:
                     continue
@@ -164,11 +165,16 @@ class DaskCluster:
                 results[number] = outcome.result
                 if done is not None:
                     done(number)
-            tell(self._progress, stage, len(items), len(items))
+            self._tell(stage, part, len(items), len(items))
         finally:
             waiting.cancel()
         path.unlink(missing_ok=True)
         return [results[number] for number in range(len(items))]
+
+    def _tell(self, stage: str, part: tuple[int, int] | None, done: int, count: int) -> None:
+        """Tell how far a stage is."""
+        if part is not None:
+            tell(self._progress, stage, part[0] * count + done, part[1] * count)
 
     def _failed(self, waiting: "_Waiting", number: int, outcome: Outcome) -> None:
         """Try again, on another worker if it is this one's device that fails; or give up."""

@@ -56,6 +56,7 @@ class Executor(Protocol):
         items: Sequence[Any],
         *,
         stage: str,
+        part: tuple[int, int] | None = (0, 1),
         done: Callable[[int], None] | None = None,
     ) -> list[Any]:
         """Do a task with each of some items.
@@ -69,6 +70,9 @@ class Executor(Protocol):
             In the order in which they are begun.
         stage : str
             What progress reports call it.
+        part : (int, int) or None
+            Number of this call, and how many calls the stage consists of; with None there are no
+            progress reports.
         done : callable, optional
             Called with the number of each item that is done, one call at a time.
 
@@ -136,6 +140,7 @@ class InProcess:
         items: Sequence[Item],
         *,
         stage: str,
+        part: tuple[int, int] | None = (0, 1),
         done: Callable[[int], None] | None = None,
     ) -> list[Result]:
         """Do a task with each of some items; see :class:`Executor`."""
@@ -148,7 +153,13 @@ class InProcess:
 
 
 def reconstruct_planes(
-    executor: Executor, work: Work, shape: tuple[int, int, int], target: PlaneWriter, *, stage: str
+    executor: Executor,
+    work: Work,
+    shape: tuple[int, int, int],
+    target: PlaneWriter,
+    *,
+    stage: str,
+    part: tuple[int, int] | None = (0, 1),
 ) -> None:
     """Reconstruct a volume, some planes a task.
 
@@ -162,18 +173,19 @@ def reconstruct_planes(
         Of the whole volume.
     target : PlaneWriter
         Takes the planes of the whole, one call at a time.
-    stage : str
-        What progress reports call it.
+    stage, part
+        As :meth:`Executor.map` takes them.
     """
     parts = executor.parts(shape)
     if executor.folder is None:
-        executor.map(_PlanesTask(work, target, threading.Lock()), parts, stage=stage)
+        executor.map(_PlanesTask(work, target, threading.Lock()), parts, stage=stage, part=part)
         return
     files = PlaneParts(executor.folder, shape)
     executor.map(
         _FiledPlanesTask(work, files),
         parts,
         stage=stage,
+        part=part,
         done=lambda number: files.hand_on(parts[number], target),
     )
 

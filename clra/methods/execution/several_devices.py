@@ -88,6 +88,7 @@ class SeveralDevices:
         items: Sequence[Item],
         *,
         stage: str,
+        part: tuple[int, int] | None = (0, 1),
         done: Callable[[int], None] | None = None,
     ) -> list[Result]:
         """Do a task with each of some items; see :class:`clra.methods.execution.executor.Executor`.
@@ -97,7 +98,7 @@ class SeveralDevices:
         Exception
             What a task raised first; the other devices stop.
         """
-        share = _Share(task, items, stage, self._progress, done)
+        share = _Share(task, items, stage, part, self._progress, done)
         with ThreadPoolExecutor(self.places) as pool:
             futures = [pool.submit(worker.run, share) for worker in self._workers]
             try:
@@ -132,10 +133,12 @@ class _Share:
         task: Task[Any, Any],
         items: Sequence[Any],
         stage: str,
+        part: tuple[int, int] | None,
         progress: ProgressCallback | None,
         done: Callable[[int], None] | None,
     ) -> None:
-        self.task, self.stage, self.progress, self.told = task, stage, progress, done
+        self.task, self.stage, self.told = task, stage, done
+        self.progress, (self.first, self.parts) = (progress, part) if part else (None, (0, 1))
         self.count = len(items)
         self.items: SimpleQueue[tuple[int, Any]] = SimpleQueue()
         for number, item in enumerate(items):
@@ -190,5 +193,6 @@ class _Worker:
             share.done += max(0.0, done - self._done)
             self._done = max(done, self._done)
             if share.progress is not None:
-                steps = min(_STEPS, round(_STEPS * share.done / share.count))
+                made = share.first + min(1.0, share.done / share.count)
+                steps = round(_STEPS * made / share.parts)
                 share.progress(Progress(share.stage, steps, _STEPS))

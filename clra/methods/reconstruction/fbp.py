@@ -47,6 +47,7 @@ def ramp_fbp(
     planes: slice | None = None,
     target: PlaneWriter | None = None,
     onto: Volume | None = None,
+    step: float = 1.0,
 ) -> Volume:
     """Reconstruct by ramp-filtered back-projection.
 
@@ -92,8 +93,10 @@ def ramp_fbp(
     target : PlaneWriter, optional
         Takes the planes of each slab as soon as it is done; the volume is then not kept.
     onto : Volume, optional
-        On the grid of the planes: changed to ``max(0, onto + what is reconstructed)`` and returned.
-        `positive` and `target` do not go with it.
+        On the grid of the planes: changed to ``max(0, onto + step * what is reconstructed)`` and
+        returned. `positive` and `target` do not go with it.
+    step : float
+        Of what is added to `onto`.
 
     Returns
     -------
@@ -172,7 +175,7 @@ def ramp_fbp(
             queue, attenuation, scale, first=first, lowest=lowest, volume_order="yxz"
         )
         if onto is not None:
-            add_to_slab(stream, onto, index, attenuation)
+            add_to_slab(stream, onto, index, attenuation, step)
         elif target is None:
             volume.put(index, attenuation)
         else:

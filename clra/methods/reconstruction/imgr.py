@@ -8,8 +8,9 @@ nothing but the registration.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +36,8 @@ from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
 from clra.model.schedule import converged, level_factor, level_name, parse_levels
-from clra.model.view_selection import sampled
-from clra.ops.streaming.multigrid import add_update, cropped, prolongate
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import Volume
+from clra.ops.streaming.volume import CroppedVolume
 
 # Cycles after which it ends in any case; without alignment a second one changes little.
 _CYCLES, _CYCLES_UNALIGNED = 3, 1
@@ -63,6 +62,7 @@ def imgr(
     state: ImgrState | None = None,
     checkpoint: Checkpoint | None = None,
     saved: Saved | None = None,
+    make_level: Callable[..., MultigridLevel] = MultigridLevel,
 ) -> MultigridResult:
     """Reconstruct from coarse to fine, and align on the way.
 
@@ -97,6 +97,8 @@ def imgr(
         Keeps what each finished level gives.
     saved : Saved, optional
         In place of `state`: what the checkpoint kept of it.
+    make_level : callable
+        Makes a :class:`MultigridLevel` of its arguments.
 
     Returns
     -------
@@ -125,9 +127,22 @@ def imgr(
     cycles = cycles or (_CYCLES if align else _CYCLES_UNALIGNED)
     start = motion or Motion.identity(scan.views)
     wide = with_margin(grid)
-    run = _Run(stream, scan, wide, factors, align, scale, anchor, osem, truth, start, checkpoint)
+    run = _Run(
+        stream,
+        scan,
+        wide,
+        factors,
+        align,
+        scale,
+        anchor,
+        osem,
+        truth,
+        start,
+        checkpoint,
+        make_level,
+    )
     if saved is not None:
-        state = ImgrState.kept(saved, stream, wide)
+        state = ImgrState.kept(saved, lambda factor, planes: run.level(factor).restored(planes))
     rejected = np.zeros(scan.views, np.bool_) if valid_views is None else ~valid_views
     run.done = state or ImgrState(None, start, rejected)
     try:
@@ -138,7 +153,8 @@ def imgr(
                 raise
             message = f"the reconstruction was ended early: it is that of {run.done.finished}"
             Finding("cancelled", message).warn()
-        volume = cropped(stream, run.full(), (wide.shape[0] - grid.shape[0]) // 2, grid)
+        margin = (wide.shape[0] - grid.shape[0]) // 2
+        volume = CroppedVolume(run.full(), margin, grid)
     except KeyboardInterrupt:
         if not run.done.steps:
             raise
@@ -161,6 +177,7 @@ class _Run:
     truth: Motion | None
     start: Motion
     checkpoint: Checkpoint | None
+    make_level: Callable[..., MultigridLevel]
     done: ImgrState = field(init=False)
 
     def __post_init__(self) -> None:
@@ -176,7 +193,7 @@ class _Run:
         while not self.done.ended:
             cycle, position = divmod(len(self.done.steps), len(self.factors))
             title = f"cycle {cycle + 1}, {level_name(self.factors[position])}"
-            done = self._correct(self._level(self.factors[position]), cycle + 1, title)
+            done = self._correct(self.level(self.factors[position]), cycle + 1, title)
             # 22, 25: until converged
             last = position + 1 == len(self.factors)
             ended = last and (cycle + 1 == most or self._converged(done))
@@ -184,14 +201,13 @@ class _Run:
             if self.checkpoint is not None:
                 self.done.keep(self.checkpoint)
 
-    def full(self) -> Volume:
+    def full(self) -> Any:
         """Return the volume at full resolution, whatever level was finished last."""
         volume = self.done.volume
-        assert volume is not None
         for factor in (4, 2, 1):
             if factor < level_factor(self.done.steps[-1].level):
-                grid = self.grid.binned(factor) if factor > 1 else self.grid
-                volume = prolongate(self.stream, volume, grid, volumes=1)
+                # Not told: whoever ended the work early still wants what is finished.
+                volume = self.level(factor).brought(volume, None)
         return volume
 
     def _correct(self, level: MultigridLevel, cycle: int, title: str) -> ImgrState:
@@ -199,7 +215,7 @@ class _Run:
         started = time.perf_counter()
         before = self.done.motion
         # 2, 23, 11, 17: the volume so far at this resolution
-        volume = self._so_far(level)
+        volume = self._so_far(level, title)
         # 5, 12, 18: simulated radiographs; 6, 13, 19: register them with the measured ones
         simulated, misfit, found = level.simulate(
             volume,
@@ -215,24 +231,22 @@ class _Run:
         shape = self.scan.geometry.shape
         moved = between(before, motion, shape, level.factor) if self.align else None
         # 15, 21: calculate the update, back-project and filter
-        update = level.correction(
-            simulated, motion, volume.grid, moved=moved, valid_views=~rejected, title=title
+        volume = level.corrected(
+            volume, simulated, motion, moved=moved, valid_views=~rejected, title=title
         )
         del simulated
-        add_update(self.stream, volume, update, sampled(level.geometry(motion), volume.grid))
-        del update
         if level.lowest:
             # 9: OSEM-TR
-            level.reconstruct(volume, motion, ~rejected, title)
+            volume = level.reconstruct(volume, motion, ~rejected, title)
         step = ImgrStep(cycle, level_name(level.factor), misfit, time.perf_counter() - started)
         self.stream.report(f"{title}: misfit {misfit:.4g} before", 1, 1)
         history = done.history if found is None else self._history(step, motion, found, level)
         return replace(done, volume=volume, steps=(*done.steps, step), history=history)
 
-    def _so_far(self, level: MultigridLevel) -> Volume:
+    def _so_far(self, level: MultigridLevel, title: str) -> Any:
         """Bring what there is to a level's resolution."""
         if self.done.volume is not None:
-            return level.brought(self.done.volume)
+            return level.brought(self.done.volume, title)
         if self.align:
             odd = self.rejections.first(self.stream, level.radiographs)
             self.done = replace(self.done, rejected=odd)
@@ -303,10 +317,10 @@ class _Run:
             self.stream.device.name,
         )
 
-    def _level(self, factor: int) -> MultigridLevel:
+    def level(self, factor: int) -> MultigridLevel:
         """Make the levels as they are needed, once each."""
         if factor not in self._levels:
-            self._levels[factor] = MultigridLevel(
+            self._levels[factor] = self.make_level(
                 self.stream,
                 self.scan,
                 self.grid,

@@ -1,37 +1,33 @@
 """One resolution of a multigrid reconstruction: Algorithm 3, what it does with its radiographs."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.alignment.reprojection import (
-    Registered,
-    binned_mask,
-    in_full_pixels,
-    register,
-    registration_for,
-    reprojected,
-)
+from clra.methods.alignment.reprojection import Registered, binned_mask, in_full_pixels, reprojected
+from clra.methods.ordered_subsets.subset_rays import VOLUMES
 from clra.methods.reconstruction.fbp import ramp_fbp
-from clra.methods.reconstruction.osem_tr import VOLUMES, OrderedSubsets, osem_tr, start_volume
-from clra.methods.reconstruction.residuals import residuals
+from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
+from clra.methods.reconstruction.residuals import RadiographComparison, residuals
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS
+from clra.model.view_selection import sampled
 from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import prolongate, restrict
 from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.slab_projector import volume_from
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import Volume
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 # At the levels that are corrected, the device holds the volume and its correction.
-_VOLUMES = 2
+CORRECTED_VOLUMES = 2
 
 
 @dataclass
@@ -55,8 +51,6 @@ class MultigridLevel:
 
     Attributes
     ----------
-    radiographs : Radiographs
-        Binned.
     volumes : int
         Volumes that the device holds at a time.
     """
@@ -67,15 +61,17 @@ class MultigridLevel:
     osem: OrderedSubsets
     factor: int
     lowest: bool
-    radiographs: Radiographs = field(init=False)
     volumes: int = field(init=False)
 
     def __post_init__(self) -> None:
-        # 1: down-sample the measured radiographs
-        self.radiographs = Radiographs(self.stream, self.scan, self.factor)
-        self.volumes = VOLUMES if self.lowest else _VOLUMES
+        self.volumes = VOLUMES if self.lowest else CORRECTED_VOLUMES
         if self.factor > 1:
             self.grid = self.grid.binned(self.factor)
+
+    @cached_property
+    def radiographs(self) -> Radiographs:
+        """The measured radiographs, binned when they are needed."""
+        return Radiographs(self.stream, self.scan, self.factor)  # 1: down-sample
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -89,7 +85,13 @@ class MultigridLevel:
         """Motions are in full-resolution pixels: absorb first, then bin."""
         return self.scan.geometry.with_motion(motion).binned(self.factor)
 
-    def first(self, motion: Motion, valid_views: Bools) -> Volume:
+    # What follows takes and returns volumes, and simulated radiographs, of its own kind.
+
+    def restored(self, planes: NDArray[np.float32]) -> Any:
+        """Return the volume of this resolution that was kept as an array (z, y, x)."""
+        return volume_from(self.stream, self.grid, planes)
+
+    def first(self, motion: Motion, valid_views: Bools) -> Any:
         """Return the volume to start from: steps 1 and 2."""
         return start_volume(
             self.stream,
@@ -100,8 +102,8 @@ class MultigridLevel:
             valid_views=valid_views,
         )
 
-    def brought(self, volume: Volume) -> Volume:
-        """Bring the volume of the level before to this resolution."""
+    def brought(self, volume: Any, title: str | None) -> Any:
+        """Bring the volume of the level before to this resolution; no title, no reports."""
         if not self.lowest:  # 11, 17
             return prolongate(self.stream, volume, self.grid, volumes=self.volumes)
         for _ in range(self.factor.bit_length() - 1):  # 23
@@ -110,14 +112,14 @@ class MultigridLevel:
 
     def simulate(
         self,
-        volume: Volume,
+        volume: Any,
         motion: Motion,
         *,
         registering: bool,
         first: bool,
         magnification: bool,
         title: str,
-    ) -> tuple[Store, float, Registered | None]:
+    ) -> tuple[Any, float, Registered | None]:
         """Project the volume, once; compare and, if asked, register chunk by chunk.
 
         Parameters
@@ -144,68 +146,55 @@ class MultigridLevel:
         found : Registered or None
             What is left of the motion.
         """
-        stream, level, geometry = self.stream, self.factor, self.geometry(motion)
-        simulated = Store(self.radiographs.shape, stream.room)
-        statistics = self.osem.statistics(stream, self.used, level)
-        registration = registration_for(
-            stream,
-            self.scan,
-            self.radiographs,
-            first=first,
-            magnification=magnification,
-        ) if registering else None  # fmt: skip
-        table = np.empty((geometry.views, len(ESTIMATE_FIELDS)))
-        for views, measured, made in reprojected(
-            stream, self.radiographs, volume, geometry, f"{title}: simulating"
-        ):
-            statistics.deviance(stream.queue, made, measured)
-            simulated.write(views.start, stream.download(made))
-            if registration is not None:
-                known = motion.magnification[views]
-                table[views] = register(stream, registration, measured, made, known)
-        misfit = statistics.misfit(stream.queue, geometry.views)
-        found = in_full_pixels(table, level, self.scan.geometry.shape) if registering else None
-        return simulated, misfit, found
+        compare = RadiographComparison(self.osem, self.used, registering, first, magnification)
+        simulated, deviance, table = self._compared(compare, volume, motion, f"{title}: simulating")
+        found = None
+        if table is not None:
+            found = in_full_pixels(table, self.factor, self.scan.geometry.shape)
+        return simulated, deviance / self.scan.views, found
 
-    def correction(
+    def corrected(
         self,
-        simulated: Store,
+        volume: Any,
+        simulated: Any,
         motion: Motion,
-        grid: VolumeGrid,
         *,
         moved: Floats | None,
         valid_views: Bools,
         title: str,
-    ) -> Volume:
-        """Filter and back-project what the radiographs hold beyond simulated ones: steps 15, 21.
+    ) -> Any:
+        """Add what the radiographs hold beyond simulated ones: steps 15, 21.
 
         Parameters
         ----------
+        volume : Volume
+            That they were simulated from; its contents are lost.
         simulated : Store
             As of `simulate`; its contents are lost.
         motion : Motion
             Of the measured radiographs.
-        grid : VolumeGrid
-            Of the volume to be corrected.
         moved : ndarray, (views, 3), optional
-            As for :func:`clra.methods.reconstruction.residuals.residuals`.
+            As for :func:`clra.methods.reconstruction.residuals.residual_chunks`.
         valid_views : ndarray of bool, (views,)
             Views to correct by, at least one.
         title : str
             What progress reports begin with.
         """
+        geometry = self.geometry(motion)
         return ramp_fbp(
             self.stream,
             residuals(self.stream, self.radiographs, simulated, self.used, moved=moved),
-            self.geometry(motion),
-            grid,
+            geometry,
+            self.grid,
             valid_views=valid_views,
             stage=f"{title}: correcting",
             volumes=self.volumes,
+            onto=volume,
+            step=sampled(geometry, self.grid),
         )
 
-    def reconstruct(self, volume: Volume, motion: Motion, valid_views: Bools, title: str) -> None:
-        """Raise the likelihood of the volume by OSEM-TR: step 9."""
+    def reconstruct(self, volume: Any, motion: Motion, valid_views: Bools, title: str) -> Any:
+        """Raise the likelihood of the volume by OSEM-TR: step 9. The volume's contents are lost."""
         osem_tr(
             self.stream,
             self.radiographs,
@@ -216,3 +205,20 @@ class MultigridLevel:
             valid_views=valid_views,
             stage=f"{title}: OSEM-TR",
         )
+        return volume
+
+    def _compared(
+        self, compare: RadiographComparison, volume: Any, motion: Motion, stage: str
+    ) -> tuple[Any, float, Floats | None]:
+        """Return what is simulated, and what :class:`RadiographComparison` does."""
+        simulated = Store(self.radiographs.shape, self.stream.room)
+        pairs = reprojected(self.stream, self.radiographs, volume, self.geometry(motion), stage)
+        deviance, table = compare(
+            self.stream,
+            self.scan,
+            self.radiographs,
+            pairs,
+            motion.magnification,
+            simulated.write,
+        )
+        return simulated, deviance, table

@@ -1,6 +1,8 @@
 """What a multigrid reconstruction tells of its steps, goes on from, and returns."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +18,9 @@ from clra.methods.execution.packing import (
     registered_arrays,
     registered_from,
 )
-from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.schedule import level_factor
-from clra.ops.streaming.slab_projector import volume_from
-from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import Volume
+from clra.ops.streaming.volume import PlaneSource
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class ImgrState:
 
     Attributes
     ----------
-    volume : Volume or None
+    volume : PlaneSource or None
         At the resolution of the last level, on the grid with its margin.
     motion : Motion
         Of the radiographs.
@@ -70,7 +69,7 @@ class ImgrState:
         By that registration, with its gauge.
     """
 
-    volume: Volume | None
+    volume: PlaneSource | None
     motion: Motion
     rejected: NDArray[np.bool_]
     steps: tuple[ImgrStep, ...] = ()
@@ -100,15 +99,21 @@ class ImgrState:
         checkpoint.save(self.finished, values, arrays, self.volume)
 
     @classmethod
-    def kept(cls, saved: Saved, stream: Stream, grid: VolumeGrid) -> "ImgrState":
-        """Return a state that was kept; `grid` is that with its margin, at full resolution."""
+    def kept(cls, saved: Saved, restored: Callable[[int, Any], PlaneSource]) -> "ImgrState":
+        """Return a state that was kept.
+
+        Parameters
+        ----------
+        saved : Saved
+            What was kept.
+        restored : callable
+            Makes a volume of the binning of its level and its planes.
+        """
         arrays, values = saved.arrays, saved.values
         steps = tuple(ImgrStep(**step) for step in values["steps"])
-        factor = level_factor(steps[-1].level)
-        grid = grid.binned(factor) if factor > 1 else grid
         cause = values["cause"]
         return cls(
-            volume=volume_from(stream, grid, saved.planes),
+            volume=restored(level_factor(steps[-1].level), saved.planes),
             motion=motion_from(arrays, "motion", cause),
             rejected=arrays["rejected"],
             steps=steps,
@@ -142,7 +147,7 @@ class MultigridResult:
 
     Attributes
     ----------
-    volume : Volume
+    volume : PlaneSource
         Attenuation [1/mm].
     motion : Motion
         Of the radiographs, estimated or given.
@@ -152,7 +157,7 @@ class MultigridResult:
         Where it aligned.
     """
 
-    volume: Volume
+    volume: PlaneSource
     motion: Motion
     steps: tuple[ImgrStep, ...]
     alignment: AlignmentResult | None

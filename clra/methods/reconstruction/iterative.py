@@ -1,7 +1,8 @@
 """Volumes by iterative methods: their options, and where their results go."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,19 @@ from clra.findings import Finding
 from clra.methods.alignment.reprojection import with_margin
 from clra.methods.alignment.result import AlignmentResult
 from clra.methods.execution.checkpoint import Checkpoint, Saved, identity
+from clra.methods.execution.executor import InProcess, WorkerGroup
 from clra.methods.reconstruction.imgr import imgr
 from clra.methods.reconstruction.imgr_state import ImgrStep
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
+from clra.methods.shared_work.shared_multigrid_level import multigrid_levels_by
+from clra.methods.shared_work.shared_ordered_subsets import shared_osem_tr, shared_start_volume
+from clra.methods.shared_work.shared_scan import SharedScan
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
-from clra.ops.streaming.multigrid import cropped
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import PlaneWriter, Volume
+from clra.ops.streaming.volume import PlaneSource, PlaneWriter
 
 METHODS = ("osem-tr", "imgr")
 
@@ -78,6 +82,7 @@ class Request:
 
 
 def iterate(
+    executor: InProcess | WorkerGroup,
     stream: Stream,
     target: PlaneWriter,
     request: Request,
@@ -87,8 +92,10 @@ def iterate(
 
     Parameters
     ----------
+    executor : InProcess or WorkerGroup
+        Who does the work.
     stream : Stream
-        Device and memory budget.
+        Device and memory budget of this process.
     target : PlaneWriter
         Takes the planes.
     request : Request
@@ -135,54 +142,80 @@ def iterate(
             osem=options,
             checkpoint=checkpoint,
             saved=saved,
+            make_level=multigrid_levels_by(executor, request.scan),
         )
         found.volume.write(target)
         return found.steps, found.alignment
-    _ordered_subsets(stream, request, checkpoint, saved).write(target)
+    margin = (with_margin(request.grid).shape[0] - request.grid.shape[0]) // 2
+    volume = _ordered_subsets(executor, stream, request, checkpoint, saved)
+    volume.write(target, slice(margin, margin + request.grid.shape[0]))
     return (), None
 
 
 def _ordered_subsets(
-    stream: Stream, request: Request, checkpoint: Checkpoint | None, saved: Saved | None
-) -> Volume:
+    executor: InProcess | WorkerGroup,
+    stream: Stream,
+    request: Request,
+    checkpoint: Checkpoint | None,
+    saved: Saved | None,
+) -> PlaneSource:
     """Raise the likelihood pass by pass, on a grid with a margin."""
     scan, grid, motion = request.scan, request.grid, request.motion
     geometry = scan.geometry if motion is None else scan.geometry.with_motion(motion)
-    radiographs, wide = Radiographs(stream, scan, 1), with_margin(grid)
-    done = 0 if saved is None else int(saved.values["passes"])
+    wide = with_margin(grid)
     options = _widened(request.options, grid, wide)
     if saved is not None and saved.planes is not None:
         options = replace(options, initial=saved.planes)
-    volume = start_volume(
-        stream, radiographs, geometry, wide, options, valid_views=request.valid_views
-    )
-    passes = done
+    passes = 0 if saved is None else int(saved.values["passes"])
+    how: dict[str, Any] = {
+        "used": np.ones(geometry.shape, np.bool_) if scan.mask is None else scan.mask,
+        "valid_views": request.valid_views,
+        "done": passes,
+    }
+    so_far: PlaneSource
 
-    def keep(number: int) -> None:
-        nonlocal passes
-        passes = number
+    def keep(number: int, volume: PlaneSource) -> None:
+        nonlocal passes, so_far
+        passes, so_far = number, volume
         if checkpoint is not None:
             kept = f"{number} of {options.passes} passes"
             checkpoint.save(kept, {"passes": number}, {}, volume)
 
-    try:
-        osem_tr(
-            stream,
-            radiographs,
-            geometry,
-            volume,
-            options,
-            used=np.ones(geometry.shape, np.bool_) if scan.mask is None else scan.mask,
-            valid_views=request.valid_views,
-            done=done,
-            after_pass=keep,
+    raising: Callable[[], object]
+    if isinstance(executor, InProcess):
+        radiographs = Radiographs(stream, scan, 1)
+        so_far = volume = start_volume(
+            stream, radiographs, geometry, wide, options, valid_views=request.valid_views
         )
+        raising = partial(
+            osem_tr, stream, radiographs, geometry, volume, options, after_pass=keep, **how
+        )
+    else:
+        shared = SharedScan(executor, scan)
+        given = shared.binned(stream, 1)
+        parts = shared_start_volume(
+            shared, stream, given, geometry, wide, options, valid_views=request.valid_views
+        )
+        so_far = shared.source(parts)
+        raising = partial(
+            shared_osem_tr,
+            shared,
+            stream,
+            given,
+            geometry,
+            parts,
+            options,
+            after_pass=lambda number, parts: keep(number, shared.source(parts)),
+            **how,
+        )
+    try:
+        raising()
     except Cancelled:
         if not passes:
             raise
         told = f"the reconstruction was ended early, after {passes} of {options.passes} passes"
         Finding("cancelled", told).warn()
-    return cropped(stream, volume, (wide.shape[0] - grid.shape[0]) // 2, grid)
+    return so_far
 
 
 def options_for(method: str, given: Mapping[str, Any]) -> Options | None:

@@ -1,23 +1,26 @@
 """Ordered-subset reconstruction from transmission data with Poisson noise (OSEM-TR)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pyopencl.array import Array
 
 from clra.errors import InputError
+from clra.methods.ordered_subsets.passes import StepRule, raise_likelihood
+from clra.methods.ordered_subsets.subset_rays import VOLUMES, SubsetRays
 from clra.methods.reconstruction.fbp import ramp_fbp
 from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
-from clra.model.subsets import ordered_subsets
+from clra.model.subsets import Views, ordered_subsets
 from clra.model.validation import whole
-from clra.ops.statistics.poisson import RayStatistics, VolumeStep
+from clra.ops.statistics.poisson import RayStatistics
 from clra.ops.streaming.multigrid import add_update
 from clra.ops.streaming.radiographs import Radiographs
 from clra.ops.streaming.slab_projector import (
+    ConstantVolume,
     SlabAdjoint,
     SlabProjector,
     constant_volume,
@@ -30,15 +33,8 @@ from clra.ops.streaming.volume import Volume
 UPDATES = ("paraboloid", "optimal", "multiplicative")
 INITIAL = ("fbp", "uniform")
 
-# Volume, numerator, denominator, and one of ones: all on the device, or all in slabs.
-VOLUMES = 4
-# A voxel whose denominator is below this part of the largest is hardly met by rays.
-_LEAST = 1e-4
-# Steps are this much longer than the paraboloids ask for. Anything below 2 still raises the
-# likelihood; 1.5 saves a pass in three, 1.9 gathers more noise.
-_RELAXATION = 1.5
-# What voxels start from in the multiplicative form, where they would be 0: a part of the mean.
-_FLOOR = 0.02
+FLOOR = 0.02
+"""Added to what the multiplicative form starts from, as what is 0 stays 0: a part of the mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +96,21 @@ class OrderedSubsets:
         if not 0 <= self.background < np.inf:
             raise InputError(f"background: found {self.background:g}, expected photons, 0 or more")
 
+    @property
+    def needs_mean(self) -> bool:
+        """Whether the volume to start from takes the mean attenuation."""
+        if not isinstance(self.initial, str):
+            return False
+        return self.initial == "uniform" or self.update == "multiplicative"
+
+    def share_out(
+        self, geometry: ConeBeamGeometry, grid: VolumeGrid, valid_views: NDArray[np.bool_] | None
+    ) -> list[Views]:
+        """Return the valid views of each subset, in the order of their use."""
+        chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
+        views = np.flatnonzero(chosen)
+        return [views[part] for part in ordered_subsets(geometry.subset(views), grid, self.subsets)]
+
     def statistics(self, stream: Stream, used: NDArray[np.bool_], level: int) -> RayStatistics:
         """Photon statistics of radiographs binned by `level`, whose `used` pixels count."""
         return RayStatistics(stream.context, self.i0 * level**2 * used, self.background * level**2)
@@ -116,7 +127,7 @@ def osem_tr(
     valid_views: NDArray[np.bool_] | None = None,
     stage: str = "OSEM-TR",
     done: int = 0,
-    after_pass: Callable[[int], None] | None = None,
+    after_pass: Callable[[int, Volume], None] | None = None,
 ) -> list[float]:
     """Raise the likelihood of a volume, one subset of the views after the other.
 
@@ -141,51 +152,19 @@ def osem_tr(
     done : int
         Passes that `volume` has had already.
     after_pass : callable, optional
-        Called with the number of each pass that is finished.
+        Called with the number of each pass that is finished, and the volume.
 
     Returns
     -------
     list of float
         Misfit of each pass: mean Poisson deviance of a ray, as each subset met the volume.
     """
-    chosen = np.ones(geometry.views, np.bool_) if valid_views is None else valid_views
-    rays = _Rays(stream, radiographs, geometry, volume, options, used, np.flatnonzero(chosen))
-    step = VolumeStep(stream.context)
-    precomputed = options.update == "paraboloid"
-    if precomputed:
-        # d = A' (a c): c are the curvatures at the measured counts, so that once is enough
-        denominator = rays.curvature(f"{stage}: weighing rays")
-        least = _LEAST * _largest(stream, denominator)
-    misfits = []
-    for number in range(done + 1, options.passes + 1):
-        seen = 0
-        for subset in rays.subsets:
-            numerator = _zeros(stream, volume)
-            if not precomputed:
-                denominator = _zeros(stream, volume)
-            for views in subset:
-                # l = A mu, and A' of what the likelihood says of it
-                stream.report(f"{stage}: pass {number}/{options.passes}", seen, rays.views)
-                rays.add(numerator, None if precomputed else denominator, views)
-                seen += views.stop - views.start
-            if not precomputed:
-                least = _LEAST * _largest(stream, denominator)
-            # mu <- max(0, mu + subsets numerator / d), or mu <- mu numerator / denominator
-            for index in range(len(volume.planes)):
-                above, below = numerator.get(index), denominator.get(index)
-                mu = writable(stream, volume, index)
-                if options.update == "multiplicative":
-                    step.multiply(stream.queue, mu, above, below)
-                else:
-                    scale = _RELAXATION * (len(rays.subsets) if precomputed else 1)
-                    step.add(stream.queue, mu, above, below, scale, least)
-                volume.put(index, mu)
-                stream.queue.finish()
-        misfits.append(rays.statistics.misfit(stream.queue, rays.views))
-        stream.report(f"{stage}: pass {number}/{options.passes}", seen, rays.views)
-        if after_pass is not None:
-            after_pass(number)
-    return misfits
+    subsets = options.share_out(geometry, volume.grid, valid_views)
+    rule = StepRule(options.update, len(subsets))
+    statistics = options.statistics(stream, used, radiographs.level)
+    work = _InOneProcess(stream, radiographs, subsets, geometry, volume, rule, statistics)
+    keep = None if after_pass is None else lambda number: after_pass(number, volume)
+    return raise_likelihood(work, rule, options.passes, stage=stage, done=done, after_pass=keep)
 
 
 def start_volume(
@@ -207,33 +186,41 @@ def start_volume(
         If a given volume is not of the grid's shape.
     """
     ordered_subsets(geometry, grid, options.subsets)  # refuses a wrong number before the long work
-    volume = constant_volume(stream, grid, volumes=VOLUMES)
+
+    def constant(value: float) -> Volume:
+        return constant_volume(stream, grid, value, volumes=VOLUMES)
+
     if not isinstance(options.initial, str):
-        given = volume_from(stream, grid, options.initial, volumes=VOLUMES)
-    elif options.initial == "fbp":
-        given = ramp_fbp(
-            stream, radiographs, geometry, grid, valid_views=valid_views, volumes=VOLUMES
-        )
-    else:
-        mean = _mean_attenuation(stream, radiographs, geometry, volume)
-        given = constant_volume(stream, grid, mean, volumes=VOLUMES)
-    add_update(stream, volume, given)
-    ramp = isinstance(options.initial, str) and options.initial == "fbp"
-    if ramp and options.update == "multiplicative":
-        # What is 0 would stay 0.
-        mean = _mean_attenuation(stream, radiographs, geometry, volume)
-        floor = constant_volume(stream, grid, _FLOOR * mean, volumes=VOLUMES)
-        add_update(stream, volume, floor)
+        volume = volume_from(stream, grid, options.initial, volumes=VOLUMES)
+        add_update(stream, volume, constant(0.0))
+        return volume
+    mean = 0.0
+    if options.needs_mean:
+        mean = mean_attenuation([ray_sums(stream, radiographs, geometry, grid)])
+    if options.initial == "uniform":
+        return constant(mean)
+    volume = ramp_fbp(
+        stream,
+        radiographs,
+        geometry,
+        grid,
+        valid_views=valid_views,
+        positive=True,
+        volumes=VOLUMES,
+    )
+    if options.needs_mean:
+        add_update(stream, volume, constant(FLOOR * mean))
     return volume
 
 
-def _mean_attenuation(
-    stream: Stream, radiographs: Radiographs, geometry: ConeBeamGeometry, volume: Volume
-) -> float:
-    """All line integrals over all lengths of rays within the volume [1/mm]."""
-    project = SlabProjector(
-        stream, constant_volume(stream, volume.grid, 1.0, volumes=VOLUMES), geometry
-    )
+def ray_sums(
+    stream: Stream, radiographs: Radiographs, geometry: ConeBeamGeometry, grid: VolumeGrid
+) -> tuple[float, float]:
+    """Sum up the line integrals of rays that meet a grid, and the lengths of these within it [mm].
+
+    Parameters are as for :func:`start_volume`.
+    """
+    project = SlabProjector(stream, ConstantVolume(stream, grid, 1.0, volumes=VOLUMES), geometry)
     integrals = lengths = 0.0
     for views in stream.chunks(geometry.views, radiographs.view_bytes):
         lengths_of = stream.empty((views.stop - views.start, *geometry.shape))
@@ -241,98 +228,80 @@ def _mean_attenuation(
         chords = stream.download(lengths_of)
         integrals += float(radiographs.read(views)[chords > 0].sum(dtype=np.float64))
         lengths += float(chords.sum(dtype=np.float64))
-    return max(integrals / lengths, 0.0) if lengths else 0.0
+    return integrals, lengths
 
 
-def _zeros(stream: Stream, volume: Volume) -> Volume:
-    return constant_volume(stream, volume.grid, volumes=VOLUMES)
+def mean_attenuation(sums: Iterable[tuple[float, float]]) -> float:
+    """Return all line integrals over all lengths [1/mm], as :func:`ray_sums` gives them."""
+    integrals, lengths = np.sum(list(sums), axis=0)
+    return max(float(integrals / lengths), 0.0) if lengths else 0.0
 
 
-class _Rays:
-    """The views of a scan in the order of their subsets, with what is needed of each."""
+class _InOneProcess:
+    """The work of :func:`clra.methods.ordered_subsets.passes.raise_likelihood`."""
 
     def __init__(
         self,
         stream: Stream,
         radiographs: Radiographs,
+        subsets: list[Views],
         geometry: ConeBeamGeometry,
         volume: Volume,
-        options: OrderedSubsets,
-        used: NDArray[np.bool_],
-        views: NDArray[np.intp],
+        rule: StepRule,
+        statistics: RayStatistics,
     ) -> None:
-        self._stream, self._radiographs, self._options = stream, radiographs, options
-        self._volume = volume
-        chosen = ordered_subsets(geometry.subset(views), volume.grid, options.subsets)
-        self._order = views[np.concatenate(chosen)]
-        ends = np.cumsum([len(subset) for subset in chosen]).tolist()
-        self.subsets = [
-            self._runs(end - len(part), end) for part, end in zip(chosen, ends, strict=True)
-        ]
-        self._geometry = geometry.subset(self._order)
-        self._forward = SlabProjector(stream, volume, self._geometry)
-        self._adjoint = SlabAdjoint(stream, volume, self._geometry)
-        self._chords: SlabProjector | None = None
-        self.statistics = options.statistics(stream, used, radiographs.level)
+        order = np.concatenate(subsets)
+        ordered = geometry.subset(order)
+        self._stream, self._volume, self._rule = stream, volume, rule
+        self._statistics = statistics
+        self._rays = SubsetRays(stream, radiographs, order, ordered, volume.grid, statistics)
+        ends = np.cumsum([len(subset) for subset in subsets]).tolist()
+        self._runs = [self._rays.runs(start, stop) for start, stop in pairwise([0, *ends])]
+        self._project = SlabProjector(stream, volume, ordered)
+        self._adjoint = SlabAdjoint(stream, volume, ordered)
+        self._views, self._seen = len(order), 0
+        self._denominator, self._largest = volume, 0.0
 
     @property
-    def views(self) -> int:
-        """Number of views."""
-        return len(self._order)
+    def subsets(self) -> int:
+        return len(self._runs)
 
-    def _runs(self, start: int, stop: int) -> list[slice]:
-        chunks = self._stream.chunks(stop - start, self._radiographs.view_bytes)
-        return [slice(start + chunk.start, start + chunk.stop) for chunk in chunks]
-
-    def curvature(self, stage: str) -> Volume:
-        """Sum A' (a c), c the curvature of each measured ray, a its length within the volume."""
-        stream, views = self._stream, len(self._order)
-        total = _zeros(stream, self._volume)
-        for run in self._runs(0, views):
-            stream.report(stage, run.start, views)
-            weighted, measured = self._lengths(run), self._measured(run)
-            self.statistics.curvature(stream.queue, weighted, weighted, measured)
-            self._adjoint(total, weighted, run)
+    def weigh(self, stage: str) -> None:
+        stream, total = self._stream, self._zeros()
+        for run in self._rays.runs(0, self._views):
+            stream.report(stage, run.start, self._views)
+            self._adjoint(total, self._rays.weighted(run), run)
             stream.queue.finish()
-        stream.report(stage, views, views)
-        self._chords = None
-        return total
+        stream.report(stage, self._views, self._views)
+        self._rays.release()
+        self._denominator, self._largest = total, _largest(stream, total)
 
-    def add(self, numerator: Volume, denominator: Volume | None, views: slice) -> None:
-        """Add what some views say of the volume; a denominator only where it changes."""
-        stream, statistics = self._stream, self.statistics
-        measured, simulated = self._measured(views), self._integrals(self._forward, views)
-        statistics.deviance(stream.queue, simulated, measured)
-        if denominator is None:
-            statistics.gradient(stream.queue, simulated, simulated, measured)
-        elif self._options.update == "optimal":
-            weighted = self._lengths(views)
-            statistics.optimal_curvature(stream.queue, weighted, simulated, weighted, measured)
-            self._adjoint(denominator, weighted, views)
-            statistics.gradient(stream.queue, simulated, simulated, measured)
-        else:
-            found = stream.empty(simulated.shape)
-            statistics.balance(stream.queue, simulated, found, measured)
-            self._adjoint(denominator, found, views)
-        self._adjoint(numerator, simulated, views)
-        stream.queue.finish()
+    def update(self, subset: int, stage: str) -> None:
+        stream, rule = self._stream, self._rule
+        numerator = self._zeros()
+        denominator = self._denominator if rule.precomputed else self._zeros()
+        for run in self._runs[subset]:
+            stream.report(stage, self._seen, self._views)
+            simulated = self._rays.projected(self._project, run)
+            above, below = self._rays.compared(simulated, run, rule.update)
+            self._adjoint(numerator, above, run)
+            if below is not None:
+                self._adjoint(denominator, below, run)
+            stream.queue.finish()
+            self._seen += run.stop - run.start
+        largest = self._largest if rule.precomputed else _largest(stream, denominator)
+        for index in range(len(self._volume.planes)):
+            mu = writable(stream, self._volume, index)
+            rule(stream, mu, numerator.get(index), denominator.get(index), largest)
+            self._volume.put(index, mu)
+        stream.report(stage, self._seen, self._views)
 
-    def _measured(self, views: slice) -> Array:
-        """Line integrals of some of the views, in their order here."""
-        read, chosen = self._radiographs.read, self._order[views]
-        return self._stream.upload(np.concatenate([read(slice(v, v + 1)) for v in chosen]))
+    def misfit(self) -> float:
+        self._seen = 0
+        return self._statistics.misfit(self._stream.queue, self._views)
 
-    def _lengths(self, views: slice) -> Array:
-        """Length of each ray within the volume [mm]."""
-        if self._chords is None:
-            ones = constant_volume(self._stream, self._volume.grid, 1.0, volumes=VOLUMES)
-            self._chords = SlabProjector(self._stream, ones, self._geometry)
-        return self._integrals(self._chords, views)
-
-    def _integrals(self, projector: SlabProjector, views: slice) -> Array:
-        integrals = self._stream.empty((views.stop - views.start, *self._geometry.shape))
-        projector(integrals, views)
-        return integrals
+    def _zeros(self) -> Volume:
+        return constant_volume(self._stream, self._volume.grid, volumes=VOLUMES)
 
 
 def _largest(stream: Stream, volume: Volume) -> float:

@@ -81,8 +81,7 @@ def reconstruct(
         Estimate the motion first, with the defaults of :func:`clra.align`; "imgr" does so on the
         way.
     device : str or cl.Device, optional
-        As `choose_device` takes it, or "all" to share the work out to all devices of the best kind;
-        alignment and iterative methods take the first of them.
+        As `choose_device` takes it, or "all" to share the work out to all devices of the best kind.
     alignment : AlignmentResult, optional
         In place of `motion`: views that it rejects are left out.
     valid_views : ndarray of bool, (views,), optional
@@ -111,8 +110,8 @@ def reconstruct(
     window : {"ram-lak", "shepp-logan", "hann"}
         Of the ramp filter of "fbp": the latter two trade resolution for less noise.
     cluster : distributed.Client or str, optional
-        Workers to share "fbp" or "katsevich" out to, and an alignment: a client of Dask, or
-        "local:N", "slurm:N", the address of a scheduler or its file. The scan has to be in a file.
+        Workers to share the work out to: a client of Dask, or "local:N", "slurm:N", the address of
+        a scheduler or its file. The scan has to be in a file.
 
     Returns
     -------
@@ -230,7 +229,7 @@ def reconstruct_into(
         valid_views = alignment.valid_views if valid_views is None else valid_views
     if valid_views is not None:
         valid_views = checked_valid_views(valid_views, scan.views)
-    check_for_cluster(cluster, scan, method, ("fbp", "katsevich"))
+    check_for_cluster(cluster, scan, method, METHODS)
     options = iterative.checked_options(method, options)
     keeping, own = checkpoint_of(checkpoint, resume)
     if keeping is not None and keeping.resume and options is None and not align:
@@ -261,7 +260,7 @@ def reconstruct_into(
                 keeping.resume = keeping.there if begun.resume else keeping.resume
             alignment = align_scan(
                 scan,
-                device=devices[0],
+                device=device,
                 progress=progress,
                 checkpoint=begun,
                 cluster=cluster,
@@ -278,13 +277,13 @@ def reconstruct_into(
             there = scan.views if valid_views is None else int(valid_views.sum())
             _warn_of_gaps(fitted, grid, there)
         steps: tuple[ImgrStep, ...] = ()
-        if options is not None:
-            request = iterative.Request(scan, grid, motion, align, valid_views, options)
-            steps, found = iterative.iterate(stream, target, request, keeping)
-            alignment = found or alignment
-        else:
-            work = SomePlanes(scan, grid, motion, valid_views, fitted, window)
-            with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+        with executing(stream, devices, cluster, keeping, progress, limits) as executor:
+            if options is not None:
+                request = iterative.Request(scan, grid, motion, align, valid_views, options)
+                steps, found = iterative.iterate(executor, stream, target, request, keeping)
+                alignment = found or alignment
+            else:
+                work = SomePlanes(scan, grid, motion, valid_views, fitted, window)
                 reconstruct_planes(executor, work, grid.shape, target, stage="back-projecting")
     if own and keeping is not None and not cancelled(findings):
         keeping.clear()

@@ -7,10 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.execution.executor import PARTS, Held, Task, WorkerGroup, slabs_of
+from clra.methods.execution.executor import (
+    PARTS,
+    Held,
+    Task,
+    WorkerGroup,
+    reconstruct_planes,
+    slabs_of,
+)
 from clra.methods.reconstruction.fitted_fbp import VOLUMES, WINDOW
 from clra.methods.shared_work.tasks import (
     Bin,
+    HandOn,
     Measured,
     NumbersOf,
     ReconstructSlab,
@@ -24,6 +32,7 @@ from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
 from clra.ops.streaming.radiographs import PerView, Radiographs
 from clra.ops.streaming.stream import Stream, equal_runs
+from clra.ops.streaming.volume import PlaneSource, PlaneWriter
 
 # Views of a task at most: what a worker that is killed loses, and what one keeps on its host.
 _MOST_VIEWS = 1024
@@ -139,7 +148,7 @@ class SharedScan:
                 volume, geometry, lacking, radiographs.level, radiographs.measured, used
             )
             self.workers.map(simulate, lacking.parts, stage=f"{stage}: simulating")
-            corrected = self.volume_parts(grid, options["volumes"])
+            corrected = self.like(volume)
             source = Measured(radiographs.level, lacking)
             task = ReconstructSlab(
                 source, geometry, corrected, options | {"window": WINDOW}, onto=volume
@@ -156,6 +165,10 @@ class SharedScan:
         self.workers.map(Simulate(volume, geometry, target, factor), target.parts, stage=stage)
         return SharedRadiographs.in_files(target, factor)
 
+    def source(self, volume: VolumeParts) -> "SharedVolume":
+        """Return a volume in files as one that can be handed on."""
+        return SharedVolume(self.workers, volume)
+
     def table(self, work: Task[slice, NDArray[np.float64]], stage: str) -> NDArray[np.float64]:
         """Do a task that returns rows (n, ...) for n views; return the rows of all views."""
         target = TableParts(self.workers.new_folder("table"))
@@ -170,10 +183,13 @@ class SharedScan:
         """Views of each task."""
         return view_chunks(self.workers.places, self.scan.views)
 
-    def radiograph_parts(self, name: str, factor: int) -> RadiographParts:
-        """Return files for radiographs of a level."""
-        shape = (self.scan.views, *self.scan.geometry.binned(factor).shape)
-        parts = RadiographParts(self.workers.new_folder(name), shape, self.chunks)
+    def radiograph_parts(
+        self, name: str, factor: int, chunks: tuple[slice, ...] | None = None
+    ) -> RadiographParts:
+        """Return files for radiographs of a level: of all views, or of as many as chunks hold."""
+        chunks = chunks or self.chunks
+        shape = (chunks[-1].stop, *self.scan.geometry.binned(factor).shape)
+        parts = RadiographParts(self.workers.new_folder(name), shape, chunks)
         weakref.finalize(parts, shutil.rmtree, parts.folder, ignore_errors=True)
         return parts
 
@@ -181,12 +197,53 @@ class SharedScan:
         """Return files for a volume, of whose kind a device holds `volumes` slabs at a time."""
         workers = self.workers
         planes = tuple(slabs_of(workers.places, workers.slab_bytes, grid.shape, volumes))
-        parts = VolumeParts(workers.new_folder("volume"), grid, planes)
+        return self._in_slabs(grid, planes)
+
+    def like(self, volume: VolumeParts) -> VolumeParts:
+        """Return files for another volume in the same slabs."""
+        return self._in_slabs(volume.grid, volume.planes)
+
+    def _in_slabs(self, grid: VolumeGrid, planes: tuple[slice, ...]) -> VolumeParts:
+        parts = VolumeParts(self.workers.new_folder("volume"), grid, planes)
         weakref.finalize(parts, shutil.rmtree, parts.folder, ignore_errors=True)
         return parts
 
 
-def view_chunks(places: int, views: int) -> tuple[slice, ...]:
+class SharedVolume(PlaneSource):
+    """A volume in files that workers hand on, so that the caller holds few planes at a time.
+
+    Parameters
+    ----------
+    workers : WorkerGroup
+        Who does the work.
+    parts : VolumeParts
+        The files.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+        Of the volume.
+    parts : VolumeParts
+        The files.
+    """
+
+    def __init__(self, workers: WorkerGroup, parts: VolumeParts) -> None:
+        self.grid, self.parts = parts.grid, parts
+        self._workers = workers
+
+    def write(self, target: PlaneWriter, planes: slice | None = None) -> None:
+        """Hand planes on; see :class:`clra.ops.streaming.volume.PlaneSource`."""
+        nz, ny, nx = self.grid.shape
+        wanted = planes or slice(0, nz)
+        shape = (wanted.stop - wanted.start, ny, nx)
+        task = HandOn(self.parts, wanted.start)
+        # Not told: whoever ended the work early still wants what is finished.
+        reconstruct_planes(
+            self._workers, task, shape, target, stage="writing the volume", part=None
+        )
+
+
+def view_chunks(places: int, views: int, each: int = PARTS) -> tuple[slice, ...]:
     """Cut views into tasks: some for each worker, none of many views."""
-    count = max(PARTS * places, -(-views // _MOST_VIEWS))
+    count = max(each * places, -(-views // _MOST_VIEWS))
     return tuple(equal_runs(views, min(views, count)))

@@ -15,7 +15,7 @@ from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
 from clra.ops.streaming.radiographs import PerView, Radiographs
 from clra.ops.streaming.stream import Stream
-from clra.ops.streaming.volume import Volume
+from clra.ops.streaming.volume import PlaneWriter, Volume
 
 
 @dataclass(frozen=True)
@@ -169,3 +169,24 @@ class Simulate:
             lacking_of=lacking_of,
         )
         self.target.write(views, made.read(slice(0, views.stop - views.start)))
+
+
+@dataclass(frozen=True)
+class HandOn:
+    """Hands some planes of a volume on.
+
+    Parameters
+    ----------
+    volume : VolumeParts
+        The volume.
+    first : int
+        Plane of it with which to begin.
+    """
+
+    volume: VolumeParts
+    first: int
+
+    def __call__(self, stream: Stream, planes: slice, target: PlaneWriter) -> None:
+        """Hand planes on; both they and `target` count from the first of all and of them."""
+        wanted = slice(self.first + planes.start, self.first + planes.stop)
+        self.volume.volume(stream).write(target, wanted)

@@ -17,7 +17,14 @@ from clra.ops.streaming.volume import Volume
 _FILE = "multigrid.cl"
 
 
-def prolongate(stream: Stream, coarse: Volume, grid: VolumeGrid, *, volumes: int = 1) -> Volume:
+def prolongate(
+    stream: Stream,
+    coarse: Volume,
+    grid: VolumeGrid,
+    *,
+    volumes: int = 1,
+    planes: slice | None = None,
+) -> Volume:
     """Interpolate a volume on a grid of voxels half as large.
 
     Parameters
@@ -30,6 +37,8 @@ def prolongate(stream: Stream, coarse: Volume, grid: VolumeGrid, *, volumes: int
         Of the result.
     volumes : int
         As for :class:`~clra.ops.streaming.volume.Volume`.
+    planes : slice, optional
+        Planes of the grid that are wanted, all by default; the volume is then on their grid.
 
     Returns
     -------
@@ -38,19 +47,22 @@ def prolongate(stream: Stream, coarse: Volume, grid: VolumeGrid, *, volumes: int
     """
     step, copy = Prolong3D(stream.context), _PlaneCopy(stream)
     last = coarse.grid.shape[0]
-    fine = Volume(stream, grid, volumes=volumes)
-    for index, planes in enumerate(fine.planes):
+    fine, begin = _wanted(stream, grid, planes, volumes)
+    for index, part in enumerate(fine.planes):
+        start, stop = begin + part.start, begin + part.stop
         # A fine plane lies between its coarse one and a neighbour.
-        low = max(0, min(planes.start // 2, last - 1) - 1)
-        high = min(last, (planes.stop - 1) // 2 + 2)
+        low = max(0, min(start // 2, last - 1) - 1)
+        high = min(last, (stop - 1) // 2 + 2)
         end = grid.shape[0] if high == last else 2 * high
         wide = stream.empty((*grid.shape[1:], end - 2 * low))
         step(stream.queue, wide, copy.gather(coarse, slice(low, high)))
-        fine.put(index, copy.cut(wide, slice(planes.start - 2 * low, planes.stop - 2 * low)))
+        fine.put(index, copy.cut(wide, slice(start - 2 * low, stop - 2 * low)))
     return fine
 
 
-def restrict(stream: Stream, fine: Volume, *, volumes: int = 1) -> Volume:
+def restrict(
+    stream: Stream, fine: Volume, *, volumes: int = 1, planes: slice | None = None
+) -> Volume:
     """Average a volume over blocks of 2 x 2 x 2 voxels.
 
     Parameters
@@ -61,6 +73,8 @@ def restrict(stream: Stream, fine: Volume, *, volumes: int = 1) -> Volume:
         To average; at the upper ends, voxels that fill no block are dropped.
     volumes : int
         As for :class:`~clra.ops.streaming.volume.Volume`.
+    planes : slice, optional
+        Planes of the result that are wanted, all by default; it is then on their grid.
 
     Returns
     -------
@@ -68,12 +82,22 @@ def restrict(stream: Stream, fine: Volume, *, volumes: int = 1) -> Volume:
         On ``fine.grid.binned(2)``.
     """
     step, copy = Restrict3D(stream.context), _PlaneCopy(stream)
-    coarse = Volume(stream, fine.grid.binned(2), volumes=volumes)
-    for index, planes in enumerate(coarse.planes):
-        block = stream.empty((*coarse.grid.shape[1:], planes.stop - planes.start))
-        step(stream.queue, block, copy.gather(fine, slice(2 * planes.start, 2 * planes.stop)))
+    coarse, begin = _wanted(stream, fine.grid.binned(2), planes, volumes)
+    for index, part in enumerate(coarse.planes):
+        start, stop = begin + part.start, begin + part.stop
+        block = stream.empty((*coarse.grid.shape[1:], stop - start))
+        step(stream.queue, block, copy.gather(fine, slice(2 * start, 2 * stop)))
         coarse.put(index, block)
     return coarse
+
+
+def _wanted(
+    stream: Stream, grid: VolumeGrid, planes: slice | None, volumes: int
+) -> tuple[Volume, int]:
+    """Return a volume for some planes of a grid, or all, and the first of them."""
+    if planes is None:
+        return Volume(stream, grid, volumes=volumes), 0
+    return Volume(stream, grid.slab(planes.start, planes.stop), volumes=volumes), planes.start
 
 
 def cropped(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from clra.model.grid import VolumeGrid
 from clra.ops.projection.transpose import Transpose
-from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import PlaneWriter, Volume
 
 Floats = NDArray[np.float32]
@@ -62,8 +62,14 @@ class RadiographParts:
 
     def write(self, views: slice, images: Floats) -> None:
         """Write one of the parts."""
+        with self.writing(views) as write:
+            write(images)
+
+    @contextmanager
+    def writing(self, views: slice) -> Iterator[Callable[[Floats], None]]:
+        """Yield what takes the images of one of the parts, some at a time."""
         with whole_file(self._path(views)) as file:
-            file.write(_bytes(np.ascontiguousarray(images, np.float32)))
+            yield lambda images: _write_to(file, images)
 
     def read(self, start: int, stop: int, rows: slice | None = None) -> Floats:
         """Return the views `start` to `stop - 1`, or rows of them, of one file or several."""
@@ -175,6 +181,14 @@ class VolumeParts:
                 cl.enqueue_copy(stream.queue, host, source, src_offset=offset)
                 file.write(_bytes(host))
 
+    def write_planes(self, index: int, values: Floats) -> None:
+        """Write a slab of an array (z, y, x), which may be mapped; what is negative becomes 0."""
+        (ny, nx, nz), planes = self.shape(index), self.planes[index]
+        with whole_file(self._path(index)) as file:
+            for rows in equal_runs(ny, -(-4 * ny * nx * nz // _PIECE_BYTES)):
+                block = np.maximum(np.asarray(values[planes, rows], np.float32), 0)
+                _write_to(file, np.moveaxis(block, 0, 2))
+
     def read(self, stream: Stream, index: int) -> cl.array.Array:
         """Return a slab on a device, where it may be changed."""
         slab = stream.empty(self.shape(index))
@@ -265,7 +279,11 @@ class _PlanesOfFile:
 
     def write(self, start: int, part: Floats, /) -> None:
         self._file.seek(start * self._stride)
-        self._file.write(_bytes(np.ascontiguousarray(part, np.float32)))
+        _write_to(self._file, part)
+
+
+def _write_to(file: IO[bytes], array: Floats) -> None:
+    file.write(_bytes(np.ascontiguousarray(array, np.float32)))
 
 
 def _read_into(file: Any, array: Floats) -> None:

@@ -1,5 +1,6 @@
 """Volumes that may lie in slabs: how they are filled, changed, projected and back-projected."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from clra.model.grid import VolumeGrid
 from clra.model.view_selection import runs, views_that_see
 from clra.ops.projection.moment_projector import MomentProjector
 from clra.ops.projection.projector import BackProjector, ForwardProjector
-from clra.ops.streaming.memory import Reused
+from clra.ops.streaming.memory import Reused, Store
 from clra.ops.streaming.stream import Stream
 from clra.ops.streaming.volume import Volume
 
@@ -40,6 +41,31 @@ def constant_volume(
         part.fill(np.float32(value), queue=stream.queue)
         volume.put(index, part)
     return volume
+
+
+class ConstantVolume(Volume):
+    """A volume of one value, whose slabs are made when they are asked for; not to be changed.
+
+    Parameters
+    ----------
+    stream, grid, value, volumes
+        As for :func:`constant_volume`.
+    """
+
+    def __init__(self, stream: Stream, grid: VolumeGrid, value: float, *, volumes: int = 1) -> None:
+        super().__init__(stream, grid, volumes=volumes)
+        self._value = np.float32(value)
+        self._last: tuple[int, Array] | None = None
+
+    def get(self, index: int) -> Array:
+        """Slab `index` (ny, nx, planes) on the device."""
+        if self._last is None or self._last[0] != index:
+            self._last = None  # before the next one is made
+            nz, ny, nx = self.slabs[index].shape
+            part = self._stream.empty((ny, nx, nz))
+            part.fill(self._value, queue=self._stream.queue)
+            self._last = index, part
+        return self._last[1]
 
 
 def volume_from(stream: Stream, grid: VolumeGrid, values: Any, *, volumes: int = 1) -> Volume:
@@ -128,6 +154,32 @@ class SlabProjector:
             The n successive views of the geometry. Slabs that none of them sees are not fetched.
         """
         return self._over_slabs((projections_out,), views)
+
+    def project_all(self, stream: Stream, projections_out: Store) -> None:
+        """Project all views of the geometry, slab by slab: of a volume in files each is read once.
+
+        Parameters
+        ----------
+        stream : Stream
+            As before.
+        projections_out : Store
+            (views, rows, columns), overwritten.
+        """
+        shape = projections_out.shape[1:]
+        begun = np.zeros(projections_out.shape[0], np.bool_)
+        for index, seeing in enumerate(self._seeing):
+            for run in runs(seeing):
+                for chunk in stream.chunks(run.stop - run.start, 4 * math.prod(shape)):
+                    views = slice(run.start + chunk.start, run.start + chunk.stop)
+                    host = np.array(projections_out.read(views.start, views.stop))
+                    host[~begun[views]] = 0
+                    part = stream.empty(host.shape)
+                    part.set(host, queue=self._queue)
+                    self._project(index, (part,), views, accumulate=True)
+                    projections_out.write(views.start, stream.download(part))
+                    begun[views] = True
+        for view in np.flatnonzero(~begun).tolist():
+            projections_out.write(view, np.zeros((1, *shape), np.float32))
 
     def _project(
         self, index: int, outputs: tuple[Array, ...], views: slice, accumulate: bool

@@ -23,7 +23,29 @@ class PlaneWriter(Protocol):
         """Take planes (n, y, x), the first of them plane `start` of the volume."""
 
 
-class Volume:
+class PlaneSource(Protocol):
+    """A volume that can be handed on plane by plane, wherever it is.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+        Of the whole volume.
+    """
+
+    grid: VolumeGrid
+
+    def write(self, target: PlaneWriter, planes: slice | None = None) -> None:
+        """Hand planes on, counted from the first of them, some at a time; all by default."""
+        ...
+
+    def to_host(self) -> Floats:
+        """Return the whole volume as a numpy array (z, y, x)."""
+        target = HostPlanes(self.grid)
+        self.write(target)
+        return target.volume
+
+
+class Volume(PlaneSource):
     """A volume in the order (y, x, z), on the device if it fits, else in slabs on the host.
 
     Parameters
@@ -92,32 +114,36 @@ class Volume:
             cl.enqueue_copy(self._stream.queue, buffer, part, dst_offset=4 * piece.start)
         return slab
 
-    def write(self, target: PlaneWriter) -> None:
-        """Hand the whole volume on, (z, y, x), some planes at a time."""
-        for index in range(len(self._planes)):
-            self.write_slab(index, self.get(index), target)
+    def write(self, target: PlaneWriter, planes: slice | None = None) -> None:
+        """Hand planes on, see :class:`PlaneSource`."""
+        wanted = planes or slice(0, self.grid.shape[0])
+        for index, slab in enumerate(self._planes):
+            first, last = max(wanted.start, slab.start), min(wanted.stop, slab.stop)
+            if first < last:
+                inside = slice(first - slab.start, last - slab.start)
+                self._hand_on(self.get(index), inside, first - wanted.start, target)
 
     def write_slab(self, index: int, part: cl.array.Array, target: PlaneWriter) -> None:
         """Hand slab `index` on, some planes at a time, whether it is kept or not."""
+        self._hand_on(part, slice(0, part.shape[2]), self._planes[index].start, target)
+
+    def _hand_on(
+        self, part: cl.array.Array, planes: slice, first: int, target: PlaneWriter
+    ) -> None:
+        """Hand planes of a slab (ny, nx, nz) on, as plane `first` and those that follow."""
         ny, nx, nz = part.shape
         stream = self._stream
-        count = min(nz, max(1, stream.budgets.piece // (4 * ny * nx)))
-        for start in range(0, nz, count):
-            n = min(count, nz - start)
-            planes = stream.empty((n, ny, nx))
+        count = max(1, stream.budgets.piece // (4 * ny * nx))
+        for start in range(planes.start, planes.stop, count):
+            n = min(count, planes.stop - start)
+            piece = stream.empty((n, ny, nx))
             self._transpose(
                 stream.queue,
-                Planes(planes, nx, nx * ny, n, nx),
+                Planes(piece, nx, nx * ny, n, nx),
                 Planes(part[:, :, start:], nx * nz, nz, nx, n),
                 ny,
             )
-            target.write(self._planes[index].start + start, stream.download(planes))
-
-    def to_host(self) -> Floats:
-        """Return the whole volume as a numpy array (z, y, x)."""
-        target = HostPlanes(self.grid)
-        self.write(target)
-        return target.volume
+            target.write(first + start - planes.start, stream.download(piece))
 
     def _start(self, index: int) -> int:
         """First element of a slab in the store."""
@@ -125,6 +151,30 @@ class Volume:
 
     def _pieces(self, size: int) -> list[slice]:
         return equal_runs(size, -(-size // max(1, self._stream.budgets.piece // 4)))
+
+
+class CroppedVolume(PlaneSource):
+    """Planes of a volume, that are taken out of it when they are handed on.
+
+    Parameters
+    ----------
+    source : PlaneSource
+        The volume.
+    first : int
+        Plane with which to begin.
+    grid : VolumeGrid
+        Of the planes.
+    """
+
+    def __init__(self, source: PlaneSource, first: int, grid: VolumeGrid) -> None:
+        self.grid = grid
+        self._source, self._first = source, first
+
+    def write(self, target: PlaneWriter, planes: slice | None = None) -> None:
+        """Hand planes on, see :class:`PlaneSource`."""
+        wanted = planes or slice(0, self.grid.shape[0])
+        first = self._first
+        self._source.write(target, slice(first + wanted.start, first + wanted.stop))
 
 
 class HostPlanes:

@@ -48,3 +48,13 @@ def scans(tmp_path_factory):
     # As few views a turn as Katsevich's method takes.
     views = {"helix": 320, "space-filling": 160}
     return {kind: scan_file(folder / f"{kind}.nxs", kind, n) for kind, n in views.items()}
+
+
+@pytest.fixture(scope="module")
+def small_scan(tmp_path_factory):
+    return scan_file(tmp_path_factory.mktemp("scans") / "small.nxs", "helix", 96, size=40)
+
+
+@pytest.fixture(scope="module")
+def few_views(tmp_path_factory):
+    return scan_file(tmp_path_factory.mktemp("scans") / "few.nxs", "space-filling", 96)

@@ -116,7 +116,7 @@ def test_radiographs_in_memory_are_refused(client, scans):
 @pytest.mark.parametrize(
     ("call", "expected"),
     [
-        (lambda scan, on: clra.reconstruct(scan, "imgr", cluster=on), "found 'imgr'"),
+        (lambda scan, on: clra.align(scan, method="reference", cluster=on), "found 'reference'"),
         (lambda scan, on: clra.align(scan, cluster="node1"), "expected ADDRESS"),
         (lambda scan, on: clra.align(scan, cluster=3), "expected a distributed"),
     ],
@@ -178,6 +178,20 @@ def test_results_keep_the_order_of_the_items(cluster):
     results = cluster.map(lambda stream, item: item**2, range(9), stage="s", done=done.append)
     assert results == [item**2 for item in range(9)]
     assert sorted(done) == list(range(9))
+
+
+def test_calls_that_are_a_stage_together(client, tmp_path):
+    told = []
+    executor = DaskCluster(client, tmp_path / "tasks", progress=told.append)
+    told.clear()
+    try:
+        for part in ((0, 2), None, (1, 2)):
+            executor.map(lambda stream, item: item, range(3), stage="s", part=part)
+    finally:
+        executor.close()
+    assert {progress.total for progress in told} == {6}
+    assert sorted({progress.done for progress in told}) == list(range(7))
+    assert [progress.done for progress in told] == sorted(progress.done for progress in told)
 
 
 def test_workers_share_the_cores(client, cluster):

@@ -45,6 +45,17 @@ for method in ("fbp", "katsevich"):
     progress = [p for p in progress if p.stage == progress[-1].stage]
     assert [p.done for p in progress] == sorted(p.done for p in progress)
     assert progress[-1].done == progress[-1].total
+options = clra.OrderedSubsets(passes=1, subsets=4)
+progress = []
+call = {"method": "osem-tr", "options": options}
+shared = clra.reconstruct(scan, device="all", progress=progress.append, **call)
+alone = clra.reconstruct(scan, **call)
+assert np.linalg.norm(shared - alone) < 1e-6 * np.linalg.norm(alone)
+done = [p.done / p.total for p in progress if p.stage == "OSEM-TR: pass 1/1"]
+assert done == sorted(done) and done[-1] == 1
+few = scan.subset(slice(None, None, 4))
+shared, alone = (clra.align(few, method="imgr", device=d, quality=False) for d in ("all", None))
+assert np.linalg.norm(shared.volume - alone.volume) < 1e-5 * np.linalg.norm(alone.volume)
 shared = clra.align(scan, schedule="1QR-1HR", device="all", quality=False)
 alone = clra.align(scan, schedule="1QR-1HR", quality=False)
 for one, other in zip(shared.motion.columns(), alone.motion.columns()):

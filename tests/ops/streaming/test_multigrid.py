@@ -8,6 +8,7 @@ from clra.model.grid import VolumeGrid
 from clra.ops.streaming.multigrid import Residual, add_update, cropped, prolongate, restrict
 from clra.ops.streaming.slab_projector import constant_volume, volume_from
 from clra.ops.streaming.stream import Stream
+from clra.ops.streaming.volume import CroppedVolume, HostPlanes
 from tests.ops.images.test_pyramid import prolonged, restricted
 
 ROUNDING = 4e-7
@@ -43,14 +44,36 @@ def test_levels(shape, planes):
     np.testing.assert_allclose(again.to_host(), prolonged(host, shape), rtol=0, atol=ROUNDING)
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_some_planes_are_those_of_the_whole(shape):
+    stream, grid = tight(shape, 2), VolumeGrid(shape=shape, voxel_size=0.1)
+    fine = volume_from(stream, grid, random_volume(shape))
+    coarse = restrict(stream, fine)
+    again = prolongate(stream, coarse, grid)
+    half, whole = coarse.to_host(), again.to_host()
+    for first, last in ((0, 1), (1, 4), (2, 6), (5, 6)):
+        planes = slice(first, last)
+        part = restrict(stream, fine, planes=planes)
+        assert part.grid == coarse.grid.slab(first, last)
+        np.testing.assert_array_equal(part.to_host(), half[planes])
+        part = prolongate(stream, coarse, grid, planes=slice(2 * first, shape[0]))
+        np.testing.assert_array_equal(part.to_host(), whole[2 * first :])
+
+
 @pytest.mark.parametrize("planes", [100, 4])
 def test_planes_are_cropped(planes):
     shape = (13, 3, 5)
     stream = tight(shape, planes)
     grid = VolumeGrid(shape=shape, voxel_size=0.1)
     values = random_volume(shape)
-    part = cropped(stream, volume_from(stream, grid, values), 3, grid.slab(3, 11))
+    volume = volume_from(stream, grid, values)
+    part = cropped(stream, volume, 3, grid.slab(3, 11))
     np.testing.assert_array_equal(part.to_host(), values[3:11])
+    part = CroppedVolume(volume, 3, grid.slab(3, 11))
+    np.testing.assert_array_equal(part.to_host(), values[3:11])
+    some = HostPlanes(grid.slab(5, 9))
+    part.write(some, slice(2, 6))
+    np.testing.assert_array_equal(some.volume, values[5:9])
 
 
 @pytest.mark.parametrize("planes", [100, 4])

@@ -1,0 +1,1 @@
+"""What reconstruction by ordered subsets is made of: rays, steps and passes."""
