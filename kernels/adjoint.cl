@@ -40,7 +40,7 @@ kernel required_group void weigh_rays(
     weighed[weighed_offset + at] = projections[projections_offset + at] * share;
 }
 
-// What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, z) on.
+// What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, k = z) on.
 always_inlined void add_columns(
     const pencil s,
     global const float *m, // the view
@@ -145,11 +145,11 @@ kernel required_group void adjoint_axial(
         // A ray that shares in a voxel passes its plane within one voxel.
         const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]);
         if (far_x + (1.0f + SLACK) >= far_y)
-            add_columns(s, m, 0, x, y, z, sum);
+            add_columns(s, m, 0, x, y, z + LIFT(m), sum);
         if (far_y + (1.0f + SLACK) >= far_x)
-            add_columns(s, m, 1, x, y, z, sum);
+            add_columns(s, m, 1, x, y, z + LIFT(m), sum);
     }
-    put(volume + ((size_t)y * nx + x) * nz + z, sum, nz - z, accumulate);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, 0, nz - z, accumulate);
 }
 
 // What the rays that are sampled across axis p give one voxel, which projects to (column, row).
@@ -213,16 +213,17 @@ kernel required_group void adjoint_voxels(
     const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
     if (x >= nx || y >= ny || z >= nz)
         return;
-    const float voxel[3] = {x, y, z};
     float sum = 0.0f;
     for (int view = 0; view < count; ++view) {
         LOAD_VIEW(m, views + view * VIEW_FLOATS);
         const pencil s = {projections + (size_t)view * (rows * COLUMNS), columns, rows};
-        const float g = AT(m + 8, x, y, z), scale = reciprocal(g);
-        const float column = AT(m, x, y, z) * scale, row = AT(m + 4, x, y, z) * scale;
+        const float voxel[3] = {x, y, z + LIFT(m)};
+        const float g = AT(m + 8, x, y, voxel[2]), scale = reciprocal(g);
+        const float column = AT(m, x, y, voxel[2]) * scale;
+        const float row = AT(m + 4, x, y, voxel[2]) * scale;
         // A ray that shares in a voxel passes its plane within one voxel.
         const float slack = 1.0f + SLACK;
-        const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]), far_z = fabs(z - m[14]);
+        const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]), far_z = fabs(voxel[2] - m[14]);
         if (far_x + slack >= LARGER(far_y, far_z - slack))
             sum += gather(s, m, 0, voxel, g, column, row);
         if (far_y + slack >= LARGER(far_x, far_z - slack))

@@ -47,7 +47,7 @@ static inline void spread(
         }
         return;
     }
-    steps step = steps_from(fma(slope, (float)start, row), slope);
+    steps step = steps_from(row, slope, start);
     if (reach <= 1.0f) { // two rows share in a voxel
         for (int k = start; k < stop; k += LANES) {
             const whole at = step_lanes(step);
@@ -143,7 +143,7 @@ kernel void adjoint_columns(
             spread(
                 projections + ((size_t)view * (columns + 1) + c) * pitch,
                 rows,
-                (z - bottom) / rise,
+                (z + LIFT(m) - bottom) / rise,
                 1.0f / rise,
                 weights,
                 sums,

@@ -10,7 +10,7 @@
 
 #include "adjoint.clh"
 
-// What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, z) on.
+// What the rays that are sampled across axis p, x or y, give VOXELS voxels from (x, y, k = z) on.
 always_inlined void add_leaning(
     const pencil s,
     const float *m, // the view
@@ -147,9 +147,9 @@ kernel required_group void adjoint_leaning(
         const float far_x = fabs(x - m[12]), far_y = fabs(y - m[13]);
         const int x_too = far_x + (1.0f + SLACK) >= far_y, y_too = far_y + (1.0f + SLACK) >= far_x;
         if (x_too)
-            add_leaning(s, m, 0, x, y, z, y_too, sum);
+            add_leaning(s, m, 0, x, y, z + LIFT(m), y_too, sum);
         if (y_too)
-            add_leaning(s, m, 1, x, y, z, x_too, sum);
+            add_leaning(s, m, 1, x, y, z + LIFT(m), x_too, sum);
     }
-    put(volume + ((size_t)y * nx + x) * nz + z, sum, nz - z, accumulate);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, 0, nz - z, accumulate);
 }

@@ -112,14 +112,14 @@ kernel void adjoint_steep(
     const int y = get_global_id(2);
     if (z >= nz || x >= nx || y >= ny)
         return;
-    const float voxel[3] = {x, y, z};
     float sum = 0.0f;
     for (int view = 0; view < count; ++view) {
         global const float *m = views + view * VIEW_FLOATS;
         global const float *image = projections + (size_t)view * (columns + 1) * pitch;
+        const float voxel[3] = {x, y, z + LIFT(m)};
         const float far_x = fabs(x - m[12]);
         const float far_y = fabs(y - m[13]);
-        const float far_z = fabs(z - m[14]);
+        const float far_z = fabs(voxel[2] - m[14]);
         // A ray that shares in a voxel passes its plane within one voxel.
         const float slack = 1.0f + SLACK;
         if (far_z + slack >= LARGER(far_x, far_y))

@@ -206,7 +206,7 @@ kernel void adjoint_tilted(
             const float beside = corner & 1 ? side + width : side - 1;
             const float x = axis ? beside : plane;
             const float y = axis ? plane : beside;
-            const float height = corner & 2 ? z + voxels : z - 1;
+            const float height = LIFT(m) + (corner & 2 ? z + voxels : z - 1);
             const float column = AT(m, x, y, height) / AT(m + 8, x, y, height);
             left = SMALLER(left, column);
             right = LARGER(right, column);
@@ -217,7 +217,7 @@ kernel void adjoint_tilted(
             fan s = {
                 t,
                 m[13 - axis] - side,
-                m[14] - z,
+                m[14] - (z + LIFT(m)),
                 sign * ALONG(float, m, axis, c, 0.0f),
                 sign * m[21 + axis],
                 sign * ALONG(float, m, 1 - axis, c, 0.0f),

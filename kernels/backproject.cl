@@ -5,7 +5,9 @@
 // The forms for GPUs; CPUs run backproject_columns.cl and backproject_tilted.cl. A work-item sums
 // VOXELS voxels along z, neighbouring ones are neighbours along x. Where v is parallel to z, a
 // block's voxels share g and the column. A block that projects into the detector as a whole takes
-// a way without tests. Every voxel has to be in front of every source (g > 0).
+// a way without tests. Every voxel has to be in front of every source (g > 0). Blocks that begin at
+// multiples of VOXELS of the whole volume's planes give each voxel the same bits in any slab: those
+// at the slab's ends may reach beyond it.
 //
 // Global size (nx, ny, ceil((top - bottom) / VOXELS)), rounded up at will.
 
@@ -54,7 +56,7 @@ kernel required_group void backproject_axial(
     const int columns, // pixels
     const int rows,
     const int count, // views
-    const int bottom, // first voxel along z to treat
+    const int bottom, // first voxel along z to treat; may be negative
     const int top, // behind the last voxel to treat
     const int accumulate) // 1: add to the volume
 {
@@ -65,7 +67,7 @@ kernel required_group void backproject_axial(
     const int z = bottom + get_global_id(2) * VOXELS;
     if (x >= nx || y >= ny || z >= top)
         return;
-    const float fx = x, fy = y, fz = z;
+    const float fx = x, fy = y;
     const float last_column = columns - 1.0f, last_row = rows - 1.0f;
     float sum[VOXELS];
 #pragma unroll
@@ -74,6 +76,7 @@ kernel required_group void backproject_axial(
     for (int view = 0; view < count; ++view) {
         global const float4 *m = (global const float4 *)(views + view * VIEW_FLOATS);
         const float4 pa = m[0], pb = m[1], pg = m[2]; // pa.z == pg.z == 0
+        const float fz = z + m[6].x;
         const float scale = reciprocal(fma(pg.x, fx, fma(pg.y, fy, pg.w)));
         const float column = fma(pa.x, fx, fma(pa.y, fy, pa.w)) * scale;
         const float slope = pb.z * scale;
@@ -107,7 +110,7 @@ kernel required_group void backproject_axial(
                     sum[k]);
         }
     }
-    put(volume + ((size_t)y * nx + x) * nz + z, sum, top - z, accumulate);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, -z, top - z, accumulate);
 }
 
 // Any pose of the detector.
@@ -124,7 +127,7 @@ kernel required_group void backproject_voxels(
     const int columns, // pixels
     const int rows,
     const int count, // views
-    const int bottom, // first voxel along z to treat
+    const int bottom, // first voxel along z to treat; may be negative
     const int top, // behind the last voxel to treat
     const int accumulate) // 1: add to the volume
 {
@@ -135,7 +138,7 @@ kernel required_group void backproject_voxels(
     const int z = bottom + get_global_id(2) * VOXELS;
     if (x >= nx || y >= ny || z >= top)
         return;
-    const float fx = x, fy = y, fz = z;
+    const float fx = x, fy = y;
     const float last_column = columns - 1.0f, last_row = rows - 1.0f;
     float sum[VOXELS];
 #pragma unroll
@@ -144,6 +147,7 @@ kernel required_group void backproject_voxels(
     for (int view = 0; view < count; ++view) {
         global const float4 *m = (global const float4 *)(views + view * VIEW_FLOATS);
         const float4 pa = m[0], pb = m[1], pg = m[2];
+        const float fz = z + m[6].x;
         const float a = fma(pa.x, fx, fma(pa.y, fy, fma(pa.z, fz, pa.w)));
         const float b = fma(pb.x, fx, fma(pb.y, fy, fma(pb.z, fz, pb.w)));
         const float g = fma(pg.x, fx, fma(pg.y, fy, fma(pg.z, fz, pg.w)));
@@ -189,5 +193,5 @@ kernel required_group void backproject_voxels(
             }
         }
     }
-    put(volume + ((size_t)y * nx + x) * nz + z, sum, top - z, accumulate);
+    put(volume + ((size_t)y * nx + x) * nz + z, sum, -z, top - z, accumulate);
 }

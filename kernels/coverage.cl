@@ -30,6 +30,7 @@ kernel required_group void coverage(
     const float last_x, // middles of the last coarse voxels
     const float last_y,
     const float last_z,
+    const float first, // plane of the whole grid with which this one begins, in coarse voxels
     const int columns, // pixels; at least 2, as are rows
     const int rows,
     const int views,
@@ -43,7 +44,7 @@ kernel required_group void coverage(
     const int k = get_global_id(0), i = get_global_id(1), j = get_global_id(2);
     if (k >= nz || i >= nx || j >= ny)
         return;
-    const float x = min((float)i, last_x), y = min((float)j, last_y), z = min((float)k, last_z);
+    const float x = min((float)i, last_x), y = min((float)j, last_y), z = first + min((float)k, last_z);
     float sum = 0.0f, needed = 0.0f;
     for (int view = 0; view < views; ++view) {
         global const float *m = matrices + 12 * view;

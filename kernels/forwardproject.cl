@@ -37,23 +37,25 @@
 #define INDEX(at) ((int)(at))
 #endif
 
-// A volume as rays along one axis p see it: sizes along p, q and l, and elements from one voxel to
-// the next.
+// A volume as rays along one axis p see it: sizes along p, q and l, elements from one voxel to the
+// next, and where voxels begin along p and l.
 typedef struct {
     global const float *volume;
     int size_p, size_q, size_l;
     OFFSET step_p, step_q, step_l;
+    int from_p, from_l;
 } scene;
 
 // one sample anywhere in a plane, towards zero outside
 static inline float
 sample(global const float *plane, const scene s, const float q, const float l)
 {
-    const int iq = below(q), il = below(l);
+    const int iq = below(q), whole = below(l), il = whole - s.from_l;
     if (iq < -1 || iq > s.size_q - 1 || il < -1 || il > s.size_l - 1)
         return 0.0f;
-    const float low_q = iq < 0 ? 0.0f : 1.0f - (q - iq), high_q = iq < s.size_q - 1 ? q - iq : 0.0f;
-    const float low_l = il < 0 ? 0.0f : 1.0f - (l - il), high_l = il < s.size_l - 1 ? l - il : 0.0f;
+    const float f = q - iq, h = l - whole;
+    const float low_q = iq < 0 ? 0.0f : 1.0f - f, high_q = iq < s.size_q - 1 ? f : 0.0f;
+    const float low_l = il < 0 ? 0.0f : 1.0f - h, high_l = il < s.size_l - 1 ? h : 0.0f;
     global const float *low = plane + max(iq, 0) * s.step_q;
     global const float *high = plane + min(iq + 1, s.size_q - 1) * s.step_q;
     const OFFSET l0 = max(il, 0) * s.step_l, l1 = min(il + 1, s.size_l - 1) * s.step_l;
@@ -75,37 +77,43 @@ always_inlined void trace(
     float *sum)
 {
     // where any ray is inside the volume and one voxel around, and where all are well inside
-    float enter = INFINITY, leave = -INFINITY, in = -start_p, out = s.size_p - 1 - start_p;
+    const int end_p = s.from_p + s.size_p - 1;
+    const float under = start_l - s.from_l, over = s.from_l + s.size_l - start_l;
+    float enter = INFINITY, leave = -INFINITY, in = s.from_p - start_p, out = end_p - start_p;
 #pragma unroll
     for (int j = 0; j < rays; ++j) {
-        float e = -start_p, o = s.size_p - 1 - start_p;
+        float e = s.from_p - start_p, o = end_p - start_p;
         keep_inside(start_q, slope_q[j], s.size_q, &e, &o);
-        keep_inside(start_l, slope_l[j], s.size_l, &e, &o);
+        keep_inside(under, slope_l[j], s.size_l, &e, &o);
         enter = SMALLER(enter, e);
         leave = LARGER(leave, o);
         keep_positive(start_q - 0.001f, slope_q[j], &in, &out);
         keep_positive(s.size_q - 1.001f - start_q, -slope_q[j], &in, &out);
-        keep_positive(start_l - 0.001f, slope_l[j], &in, &out);
-        keep_positive(s.size_l - 1.001f - start_l, -slope_l[j], &in, &out);
+        keep_positive(under - 0.001f, slope_l[j], &in, &out);
+        keep_positive(over - 1.001f, -slope_l[j], &in, &out);
     }
     if (!(enter <= leave))
         return;
-    const int first = max((int)(enter + start_p), 0);
-    const int last = min((int)(leave + start_p) + 1, s.size_p - 1);
+    const int first = max(below(enter + start_p), s.from_p);
+    const int last = min(below(leave + start_p) + 1, end_p);
     // planes from..to - 1 without tests
     int from = last + 1, to = last + 1;
     if (in <= out) {
         from = min(max((int)ceil(in + start_p), first), last + 1);
-        to = max(min((int)(out + start_p), last) + 1, from);
+        to = max(min(below(out + start_p), last) + 1, from);
     }
-    global const float *at = s.volume + first * (size_t)s.step_p;
+    // voxel (k, 0, 0) along p, q and l is `at` k steps on
+    global const float *at =
+        s.volume + (first - s.from_p) * (long)s.step_p - s.from_l * (long)s.step_l;
     float t = first - start_p;
 #ifndef INSIDE // leaves the ways with tests out, to count instructions
 #pragma unroll 1
     for (int plane = first; plane < from; ++plane, t += 1.0f, at += s.step_p)
 #pragma unroll
         for (int j = 0; j < rays; ++j)
-            sum[j] += sample(at, s, fma(t, slope_q[j], start_q), fma(t, slope_l[j], start_l));
+            sum[j] += sample(
+                at + s.from_l * (long)s.step_l, s, fma(t, slope_q[j], start_q),
+                fma(t, slope_l[j], start_l));
 #endif
     for (int plane = from; plane < to; ++plane, t += 1.0f, at += s.step_p) {
         float f;
@@ -132,21 +140,23 @@ always_inlined void trace(
     for (int plane = to; plane <= last; ++plane, t += 1.0f, at += s.step_p)
 #pragma unroll
         for (int j = 0; j < rays; ++j)
-            sum[j] += sample(at, s, fma(t, slope_q[j], start_q), fma(t, slope_l[j], start_l));
+            sum[j] += sample(
+                at + s.from_l * (long)s.step_l, s, fma(t, slope_q[j], start_q),
+                fma(t, slope_l[j], start_l));
 #endif
 }
 
 #define ACROSS_X                                                                                   \
     {                                                                                              \
-        volume, nx, ny, nz, NZ, (OFFSET)(NX) * NZ, 1                                               \
+        volume, nx, ny, nz, NZ, (OFFSET)(NX) * NZ, 1, 0, LIFT(m)                                   \
     }
 #define ACROSS_Y                                                                                   \
     {                                                                                              \
-        volume, ny, nx, nz, (OFFSET)(NX) * NZ, NZ, 1                                               \
+        volume, ny, nx, nz, (OFFSET)(NX) * NZ, NZ, 1, 0, LIFT(m)                                   \
     }
 #define ACROSS_Z                                                                                   \
     {                                                                                              \
-        volume, nz, nx, ny, 1, NZ, (OFFSET)(NX) * NZ                                               \
+        volume, nz, nx, ny, 1, NZ, (OFFSET)(NX) * NZ, LIFT(m), 0                                   \
     }
 
 // v is parallel to z, and no ray advances fastest along z.

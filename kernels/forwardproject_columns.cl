@@ -45,6 +45,7 @@ kernel void forward_columns(
     const float start_p = m[12 + axis];
     const float start_q = m[13 - axis];
     const float start_z = m[14];
+    const int lift = LIFT(m);
     const float advance = ALONG(float, m, axis, c, 0.0f);
     const float drift = ALONG(float, m, 1 - axis, c, 0.0f);
     const float rise = ALONG(float, m, 2, c, (float)r);
@@ -80,8 +81,8 @@ kernel void forward_columns(
         const float slope = t * rise_per_row;
         // the rows at the volume's ends
         const float per_voxel = 1.0f / slope;
-        const float one = (-1.0f - z) * per_voxel;
-        const float other = (nz - z) * per_voxel;
+        const float one = (lift - 1 - z) * per_voxel;
+        const float other = (lift + nz - z) * per_voxel;
         const float first = SMALLER(one, other);
         const float last = LARGER(one, other);
         if (last < 0.0f || first >= pixels)
@@ -99,7 +100,7 @@ kernel void forward_columns(
             for (int k = start; k < stop; ++k) {
                 const float h = fma(slope, (float)k, z);
                 const float value =
-                    line_weight * tap(line, nz, h) + next_weight * tap(next, nz, h);
+                    line_weight * tap(line, nz, lift, h) + next_weight * tap(next, nz, lift, h);
                 sum[k] += value;
 #ifdef MOMENT
                 moment[k] += value / t;
@@ -107,9 +108,9 @@ kernel void forward_columns(
             }
             continue;
         }
-        steps step = steps_from(fma(slope, (float)start, z), slope);
+        steps step = steps_from(z, slope, start);
         for (int k = start; k < stop; k += LANES) {
-            const int base = step_base(step);
+            const int base = step_base(step) - lift;
             const whole at = step_lanes(step);
             real value;
             if ((uint)base <= (uint)(nz - PIECE)) {

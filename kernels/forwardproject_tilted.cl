@@ -32,7 +32,9 @@ static inline void add_planes(
     const size_t stride_q = stride(s, q);
     const float start_p = s.view[12 + p];
     const float start_q = s.view[12 + q];
+    const int lift = origin(s, 2);
     const float start_z = s.view[14];
+    const float over_first = start_z - lift; // of the source over the volume's plane 0
     // Ray (c, r + k) advances by dp + k vp along p, and so on; turned round if that is negative.
     const float sign = ALONG(float, s.view, p, c, r + from) > 0.0f ? 1.0f : -1.0f;
     const float dp = sign * ALONG(float, s.view, p, c, r), vp = sign * s.view[21 + p];
@@ -47,7 +49,7 @@ static inline void add_planes(
         // the rows whose rays pass within a voxel of the volume
         float enter = from, leave = stop - 1.0f;
         const float left = start_q + 1.0f, right = across - start_q;
-        const float below_z = start_z + 1.0f, above_z = s.nz - start_z;
+        const float below_z = over_first + 1.0f, above_z = s.nz - over_first;
         keep_positive(fma(t, dq, left * dp), fma(t, vq, left * vp), &enter, &leave);
         keep_positive(fma(-t, dq, right * dp), fma(-t, vq, right * vp), &enter, &leave);
         keep_positive(fma(t, dz, below_z * dp), fma(t, vz, below_z * vp), &enter, &leave);
@@ -65,9 +67,9 @@ static inline void add_planes(
                 const int low = below(at_q);
                 float value = 0.0f;
                 if (low >= 0 && low < across)
-                    value = (1.0f - (at_q - low)) * tap(lines + low * stride_q, s.nz, at_z);
+                    value = (1.0f - (at_q - low)) * tap(lines + low * stride_q, s.nz, lift, at_z);
                 if (low >= -1 && low + 1 < across)
-                    value += (at_q - low) * tap(lines + (low + 1) * stride_q, s.nz, at_z);
+                    value += (at_q - low) * tap(lines + (low + 1) * stride_q, s.nz, lift, at_z);
                 sum[k] += value;
 #ifdef MOMENT
                 moment[k] += value / t;
@@ -87,8 +89,8 @@ static inline void add_planes(
                 const real end_scale = t / (vp * end_row + dp);
                 const real q = (vq * row + dq) * scale + (start_q + 1.0f);
                 const real end_q = (vq * end_row + dq) * end_scale + (start_q + 1.0f);
-                const real z = (vz * row + dz) * scale + (start_z + PAD);
-                const real end_z = (vz * end_row + dz) * end_scale + (start_z + PAD);
+                const real z = (vz * row + dz) * scale + (over_first + PAD);
+                const real end_z = (vz * end_row + dz) * end_scale + (over_first + PAD);
                 const real left = SMALLER(q, end_q), right = LARGER(q, end_q);
                 const real bottom = SMALLER(z, end_z), top = LARGER(z, end_z);
                 const whole low = to_whole(LARGER(left, (real)(0.0f))) - 1;
@@ -110,7 +112,7 @@ static inline void add_planes(
                     break;
                 const int base = bases[run];
                 const real q = t * load_lanes(slopes_q + k) + (start_q - lows[run]);
-                const real beyond = t * load_lanes(slopes_z + k) + (start_z - base);
+                const real beyond = t * load_lanes(slopes_z + k) + (start_z - (lift + base));
                 global const float *line = lines + lows[run] * (long)stride_q;
                 real value;
                 if (kinds[run] >= 0) {

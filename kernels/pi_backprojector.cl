@@ -29,7 +29,7 @@ kernel required_group void pi_backproject(
     const ulong views_offset, // a multiple of 4
     global const float *restrict window, // (columns + 1, 2) lower and upper border [row]
     const ulong window_offset,
-    global const float *restrict spans, // (helices, ny, nx, 2) [voxel]
+    global const float *restrict spans, // (helices, ny, nx, 2) [plane of the whole volume]
     const ulong spans_offset,
     const int nx, // voxels
     const int ny,
@@ -39,7 +39,8 @@ kernel required_group void pi_backproject(
     const int count, // views
     const int helices,
     const int helix, // that the views are of
-    const int bottom, // first voxel along z to treat
+    const int first_plane, // of the whole volume, with which this one begins
+    const int bottom, // first voxel along z to treat; may be negative
     const int top, // behind the last voxel to treat
     const float z_step) // of the source from view to view, positive [voxel]
 {
@@ -55,9 +56,10 @@ kernel required_group void pi_backproject(
     spans += spans_offset + 2 * line;
     global const float *own = spans + helix * of_helix;
     const int voxels = min(VOXELS, top - z);
-    if (own[1] <= z || own[0] >= z + voxels - 1)
+    const int plane = first_plane + z;
+    if (own[1] <= plane || own[0] >= plane + voxels - 1)
         return;
-    const float fx = x, fy = y, fz = z, last_row = rows - 1.0f;
+    const float fx = x, fy = y, last_row = rows - 1.0f;
     float sum[VOXELS];
 #pragma unroll
     for (int k = 0; k < VOXELS; ++k)
@@ -65,6 +67,7 @@ kernel required_group void pi_backproject(
     for (int view = 0; view < count; ++view) {
         global const float4 *m = (global const float4 *)(views + view * VIEW_FLOATS);
         const float4 pa = m[0], pb = m[1], pg = m[2]; // pa.z == pg.z == 0
+        const float fz = z + m[6].x;
         const float scale = reciprocal(fma(pg.x, fx, fma(pg.y, fy, pg.w)));
         const float column = fma(pa.x, fx, fma(pa.y, fy, pa.w)) * scale;
         if (!(column >= 0.0f && column <= columns - 1.0f))
@@ -128,6 +131,6 @@ kernel required_group void pi_backproject(
     volume += line * nz + z;
 #pragma unroll
     for (int k = 0; k < VOXELS; ++k)
-        if (k < voxels)
-            volume[k] += sum[k] * share_of(spans, of_helix, helices, helix, (float)(z + k));
+        if ((uint)(z + k) < (uint)(z + voxels))
+            volume[k] += sum[k] * share_of(spans, of_helix, helices, helix, (float)(plane + k));
 }

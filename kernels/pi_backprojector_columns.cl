@@ -25,7 +25,7 @@ kernel void pi_columns(
     const ulong views_offset,
     global const float *restrict window, // (columns + 1, 2) lower and upper border [row]
     const ulong window_offset,
-    global const float *restrict spans, // (helices, ny, nx, 2) [voxel]
+    global const float *restrict spans, // (helices, ny, nx, 2) [plane of the whole volume]
     const ulong spans_offset,
     const int nx, // voxels
     const int ny,
@@ -36,7 +36,8 @@ kernel void pi_columns(
     const int count, // views
     const int helices,
     const int helix, // that the views are of
-    const int bottom, // first voxel along z to treat
+    const int first_plane, // of the whole volume, with which this one begins
+    const int bottom, // first voxel along z to treat; may be negative
     const int top, // behind the last voxel to treat
     const int strip, // columns of voxels along x that are treated for all y before others are
     const float z_step) // of the source from view to view, positive [voxel]
@@ -55,7 +56,8 @@ kernel void pi_columns(
     const size_t column_of_voxels = (size_t)y * nx + x;
     const size_t of_helix = (size_t)2 * nx * ny;
     global const float *own = spans + helix * of_helix + 2 * column_of_voxels;
-    if (own[1] <= z || own[0] >= z + voxels - 1)
+    const int plane = first_plane + z;
+    if (own[1] <= plane || own[0] >= plane + voxels - 1)
         return;
 
     float sum[BLOCK];
@@ -68,8 +70,8 @@ kernel void pi_columns(
         const float column = fma(m[0], (float)x, fma(m[1], (float)y, m[3])) * scale;
         if (!(column >= 0.0f && column <= columns - 1.0f))
             continue;
-        const float row =
-            fma(m[4], (float)x, fma(m[5], (float)y, fma(m[6], (float)z, m[7]))) * scale;
+        const int origin = z + (int)LIFT(m);
+        const float row = fma(m[4], (float)x, fma(m[5], (float)y, m[7])) * scale; // at k = 0
         const float slope = m[6] * scale;
         const int c = (int)column;
         const float f = column - c;
@@ -85,38 +87,41 @@ kernel void pi_columns(
         const float lowest = SMALLER(one, other);
         const float highest = LARGER(one, other);
         const float soft = half_width * fabs(per_row);
-        if (highest + soft <= 0.0f || lowest - soft >= voxels - 1)
+        const int first = below(LARGER(lowest - soft, origin - 1.0f)) - origin;
+        const int last = below(SMALLER(highest + soft, (float)(origin + BLOCK))) - origin;
+        const int start = max(first & -LANES, 0);
+        const int stop = min(last + 1, voxels);
+        if (start >= stop)
             continue;
-        const int start = (int)LARGER(lowest - soft, 0.0f) / LANES * LANES;
-        const int stop = (int)SMALLER(highest + soft, voxels - 1.0f) + 1;
 
         global const float *line = projections + ((size_t)view * (columns + 1) + c) * pitch;
         global const float *next = line + pitch;
         const float next_weight = f * scale;
         const float line_weight = scale - next_weight;
         if (fabs(slope) * (LANES - 1) <= SPAN) {
-            steps step = steps_from(fma(slope, (float)start, row), slope);
+            steps step = steps_from(row, slope, origin + start);
             for (int k = start; k < stop; k += LANES) {
                 const int base = step_base(step);
                 const whole at = step_lanes(step);
                 const piece both = blend(line_weight, line + base, next_weight, next + base);
                 real value = between(both, whole_part(at), fraction(at));
-                if (k < lowest + soft || k + (LANES - 1) > highest - soft)
-                    value *= inside(slope * ((float)k + RAMP) + row, low, high, per_width);
+                const float height = origin + k;
+                if (height < lowest + soft || height + (LANES - 1) > highest - soft)
+                    value *= inside(slope * (height + RAMP) + row, low, high, per_width);
                 store_lanes(load_lanes(sum + k) + value, sum + k);
                 step.lowest += step.advance;
             }
             continue;
         }
         for (int k = start; k < stop; ++k) {
-            const float r = fma(slope, (float)k, row);
+            const float r = fma(slope, (float)(origin + k), row);
             const float chi = FIRST(inside((real)(r), low, high, per_width));
-            sum[k] += chi * (line_weight * tap(line, rows, r) + next_weight * tap(next, rows, r));
+            sum[k] += chi * (line_weight * tap(line, rows, 0, r) + next_weight * tap(next, rows, 0, r));
         }
     }
 
     volume += column_of_voxels * nz + z;
     spans += 2 * column_of_voxels;
-    for (int k = 0; k < voxels; ++k)
-        volume[k] += sum[k] * share_of(spans, of_helix, helices, helix, (float)(z + k));
+    for (int k = max(-z, 0); k < voxels; ++k)
+        volume[k] += sum[k] * share_of(spans, of_helix, helices, helix, (float)(plane + k));
 }

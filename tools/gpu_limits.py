@@ -150,7 +150,7 @@ LIMITS = (
         {"all": 150}, registers=96, defines={"INSIDE": 3},
     ),
     # Rays that advance fastest along z, and detectors turned by more than 45 degrees.
-    Limit("adjoint.cl", "adjoint_voxels", "adjoint, steep", by_rays, {"all": 270}),
+    Limit("adjoint.cl", "adjoint_voxels", "adjoint, steep", by_rays, {"all": 272}),
     Limit(
         "pi_backprojector.cl", "pi_backproject", "pi-line back-projection", busiest(8),
         {"all": 36, "MUFU+CVT": 1}, defines=INSIDE,

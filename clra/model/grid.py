@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,7 @@ class VolumeGrid:
     shape: tuple[int, int, int]
     voxel_size: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    _cut: tuple[VolumeGrid, int] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if np.shape(self.shape) != (3,):
@@ -76,8 +77,21 @@ class VolumeGrid:
         matrix[:3, 3] = np.array(self.centre) - (sizes - 1) / 2 * self.voxel_size
         return matrix
 
+    @property
+    def whole(self) -> VolumeGrid:
+        """The grid that this one is a slab of; itself if it is none."""
+        return self if self._cut is None else self._cut[0]
+
+    @property
+    def first(self) -> int:
+        """Plane of :attr:`whole` with which this grid begins."""
+        return 0 if self._cut is None else self._cut[1]
+
     def slab(self, start: int, stop: int) -> VolumeGrid:
         """Return the grid of the planes `start` to `stop - 1` along z.
+
+        It remembers the grid that it was cut from, so that operators compute its voxels with the
+        same roundings as the whole's.
 
         Raises
         ------
@@ -87,7 +101,10 @@ class VolumeGrid:
         nz, ny, nx = self.shape
         if not 0 <= start < stop <= nz:
             raise InputError(f"slab: found {start}:{stop}, expected 0 <= start < stop <= {nz}")
-        return self._moved((stop - start, ny, nx), self.voxel_size, (0, 0, start))
+        first = self.first + start
+        part = self.whole._moved((stop - start, ny, nx), self.voxel_size, (0, 0, first))
+        object.__setattr__(part, "_cut", (self.whole, first))
+        return part
 
     def binned(self, factor: int = 2) -> VolumeGrid:
         """Return the grid of voxels `factor` times larger, with the same lower corner.

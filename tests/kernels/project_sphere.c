@@ -17,7 +17,7 @@
 #include "clra_kernels.h"
 
 enum { VIEWS = 5, COLUMNS = 23, ROWS = 19, N = 21 }; /* N voxels along each axis */
-enum { VIEW_FLOATS = 24 }; /* geometry.clh */
+enum { VIEW_FLOATS = 28 }; /* geometry.clh */
 static const double VOXEL = 0.1, SOURCE = 5.0, DETECTOR = 3.0, PIXEL = 0.17; /* mm */
 enum { DIAMETER = 16 }; /* voxels */
 static const float ATTENUATION = 1.0f / 512; /* 1/mm */

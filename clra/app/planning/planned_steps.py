@@ -174,10 +174,11 @@ def _planes(
 
 
 def _binning(geometry: ConeBeamGeometry, level: int, workers: Workers) -> PlannedStep:
-    from clra.methods.shared_work.shared_scan import view_chunks
+    from clra.methods.shared_work.shared_scan import chunks_each, view_chunks
 
     stored = 4.0 * geometry.views * geometry.rows * geometry.columns
-    tasks = len(view_chunks(workers.count, geometry.views))
+    each = chunks_each(workers.count, geometry)
+    tasks = len(view_chunks(workers.count, geometry.views, each))
     seconds = stored / 4 * _READ_S * workers.slowdown
     return PlannedStep("binning", tasks, seconds, stored, stored / level**2)
 
@@ -189,13 +190,14 @@ def _iteration(
     from clra.methods.alignment.options import Solver
     from clra.methods.execution.executor import slabs_of
     from clra.methods.reconstruction.fitted_fbp import VOLUMES
-    from clra.methods.shared_work.shared_scan import view_chunks
+    from clra.methods.shared_work.shared_scan import chunks_each, view_chunks
 
     terms = Solver().terms
     binned = geometry.binned(level) if level > 1 else geometry
     grid = grid.binned(level) if level > 1 else grid
     slabs = slabs_of(workers.count, workers.slab_bytes, grid.shape, VOLUMES if terms else 1)
-    chunks = len(view_chunks(workers.count, geometry.views))
+    each = chunks_each(workers.count, geometry)
+    chunks = len(view_chunks(workers.count, geometry.views, each))
     seen, rows = _seen_by_slabs(binned, grid, len(slabs))
     looked_at = rows * binned.columns
     view = float(binned.rows * binned.columns)

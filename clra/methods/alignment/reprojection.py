@@ -198,12 +198,12 @@ def reprojected(
         float32 (n, rows, columns), valid until the next chunk.
     """
     project = SlabProjector(stream, volume, geometry)
-    views, rows, columns = radiographs.shape
-    for chunk in stream.chunks(views, radiographs.view_bytes):
+    views = geometry.views
+    chunks = stream.chunks(views, radiographs.view_bytes)
+    stream.report(stage, 0, views)
+    for chunk, simulated in project.in_chunks(stream, chunks):
         stream.report(stage, chunk.start, views)
         measured = radiographs.on_device(stream, chunk)
-        simulated = stream.empty((chunk.stop - chunk.start, rows, columns))
-        project(simulated, chunk)
         yield chunk, measured, simulated
         stream.queue.finish()
         del measured, simulated

@@ -141,14 +141,14 @@ def reprojections(
     radiographs = Radiographs.of(kept, level)
     measured, used = lacking_of or (None, None)
     subtract = None if used is None else Residual(stream.context, used)
-    for views in stream.chunks(geometry.views, radiographs.view_bytes):
+    chunks = stream.chunks(geometry.views, radiographs.view_bytes)
+    for views, projected in project.in_chunks(stream, chunks):
         stream.report(stage, views.start, geometry.views)
-        projected = stream.empty((views.stop - views.start, *geometry.shape))
-        project(projected, views)
         if measured is not None and subtract is not None:
             there = stream.upload(measured.read(views))
             still = np.tile(np.array([0, 0, 1], np.float32), (len(projected), 1))
             subtract(stream.queue, projected, there, projected, stream.upload(still))
         kept.write(views.start, stream.download(projected))
+        del projected
     stream.report(stage, geometry.views, geometry.views)
     return radiographs

@@ -1,7 +1,9 @@
 """A scan whose radiographs and volumes of all resolutions are files that workers share."""
 
+import math
 import shutil
 import weakref
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ from clra.methods.shared_work.tasks import (
 )
 from clra.methods.truncation import extension
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.grid import VolumeGrid
+from clra.model.grid import VolumeGrid, default_grid
 from clra.model.scan import Scan
 from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumeParts
 from clra.ops.streaming.radiographs import PerView, Radiographs
@@ -178,10 +180,11 @@ class SharedScan:
         finally:
             shutil.rmtree(target.folder, ignore_errors=True)
 
-    @property
+    @cached_property
     def chunks(self) -> tuple[slice, ...]:
         """Views of each task."""
-        return view_chunks(self.workers.places, self.scan.views)
+        each = chunks_each(self.workers.places, self.scan.geometry)
+        return view_chunks(self.workers.places, self.scan.views, each)
 
     def radiograph_parts(
         self, name: str, factor: int, chunks: tuple[slice, ...] | None = None
@@ -241,6 +244,24 @@ class SharedVolume(PlaneSource):
         reconstruct_planes(
             self._workers, task, shape, target, stage="writing the volume", part=None
         )
+
+
+def chunks_each(places: int, geometry: ConeBeamGeometry) -> int:
+    """Return how many chunks of views a worker should have of those that read a volume.
+
+    Several, so that a slow worker holds the others up less; but together they had better read no
+    more of the volume, at half the resolution, than of the radiographs.
+
+    Parameters
+    ----------
+    places : int
+        Workers.
+    geometry : ConeBeamGeometry
+        Of the scan at full resolution.
+    """
+    images = geometry.views * geometry.rows * geometry.columns / 4
+    volume = math.prod(default_grid(geometry).shape) / 8
+    return int(np.clip(images / (places * volume), 1, PARTS))
 
 
 def view_chunks(places: int, views: int, each: int = PARTS) -> tuple[slice, ...]:

@@ -148,7 +148,8 @@ class Coverage:
         """Projection matrices from the middles of coarse voxels."""
         to_fine = np.diag([*self._blocks, 1.0])
         to_fine[:3, 3] = (self._blocks - 1) / 2
-        matrices = geometry.projection_matrices() @ self._grid.index_to_world() @ to_fine
+        whole = self._grid.whole  # of all slabs the same, so that all count the same views
+        matrices = geometry.projection_matrices() @ whole.index_to_world() @ to_fine
         return np.asarray(matrices.reshape(-1, 12))
 
     def compute(
@@ -179,6 +180,7 @@ class Coverage:
             self._ray_weight,
             *self._coarse,
             *self._last_middles,
+            self._grid.first / float(self._blocks[2]),
             *self._detector,
             self._counted[0],
             0 if self._rays is None else _SAMPLES,

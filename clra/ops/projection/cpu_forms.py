@@ -160,7 +160,8 @@ class CpuBack:
         self._layout = layout
         kernels = ("backproject_columns", "backproject_tilted")
         strip = {"STRIP": _STRIP}
-        self._project = Blocks(layout, "backproject", kernels, layout.sizes[2], _LINE, strip)
+        length = layout.before + layout.sizes[2]
+        self._project = Blocks(layout, "backproject", kernels, length, _LINE, strip)
 
     def __call__(
         self,

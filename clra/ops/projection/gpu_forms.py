@@ -9,6 +9,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from clra.ops.projection.layout import Layout
+from clra.ops.projection.view_table import ALIGNED
 from clra.ops.runtime.kernel import Step
 
 _GROUP = (32, 8, 1)
@@ -132,7 +133,7 @@ class GpuBack:
         layout = self._layout
         nx, ny, nz = layout.sizes
         launches = list(self._launches(views))
-        if not accumulate and any(top - bottom < nz for _, bottom, top in launches):
+        if not accumulate and any(bottom > 0 or top < nz for _, bottom, top in launches):
             zero = np.zeros(1, np.float32)
             memory: Any = volume.base_data
             event = cl.enqueue_fill(
@@ -160,7 +161,10 @@ class GpuBack:
         return event
 
     def _launches(self, views: slice) -> Iterator[tuple[slice, int, int]]:
-        """Yield views and the voxels along z that they see: the first, and one past the last."""
+        """Yield views and the voxels along z that they see: the first, and one past the last.
+
+        The first is a multiple of `ALIGNED` in the whole grid, for one beyond it may be negative.
+        """
         layout = self._layout
         for part in runs(layout, views):
             heights = layout.heights[part]
@@ -172,7 +176,8 @@ class GpuBack:
             for run in equal_parts(part, pieces):
                 seen = layout.heights[run]
                 bottom = min(int(seen[:, 0].min()), layout.sizes[2] - 1)
-                yield run, bottom, max(int(seen[:, 1].max()), bottom + 1)
+                top = max(int(seen[:, 1].max()), bottom + 1)
+                yield run, bottom - (layout.before + bottom) % ALIGNED, top
 
 
 class GpuAdjoint:

@@ -1,4 +1,4 @@
-"""What the projectors share: their table of views, and the order that they want data in.
+"""What the projectors share: views on the device, and the order that they want data in.
 
 Kernels read projections as (view, column, row) and volumes as (y, x, z), see geometry.clh. A
 :class:`Layout` turns the caller's arrays into those and back, in scratch memory of its own.
@@ -16,6 +16,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.ops.projection.transpose import Planes, Transpose
 from clra.ops.projection.view_arguments import check_geometry, successive
+from clra.ops.projection.view_table import ALIGNED, view_table
 from clra.ops.runtime.buffers import Allocator, Scratch, check_array, check_queue, to_device, within
 from clra.ops.runtime.profile import DeviceProfile, profile_of
 
@@ -63,7 +64,9 @@ class Layout:
     steep : bool
         Whether rays may advance fastest along z.
     table : Array
-        (views, 24), see geometry.clh.
+        (views, 28), see geometry.clh.
+    before : int
+        Planes of the whole grid between the last that is a multiple of `ALIGNED` and this grid.
     sizes : tuple of int
         nx, ny, nz.
     detector : tuple of int
@@ -91,6 +94,7 @@ class Layout:
         self.grid = grid
         self.lanes = profile.projector_lanes
         self.sizes = grid.shape[::-1]
+        self.before = grid.first % ALIGNED
         self.detector = (geometry.columns, geometry.rows, _pitch(geometry.rows))
         self._view_shape = view_shape(self.profile, geometry.shape)
         self._view_elements = self._view_shape[0] * self._view_shape[1]
@@ -300,37 +304,3 @@ def _steep(geometry: ConeBeamGeometry) -> bool:
     nearest = np.sum(corners[:, :, :2] * level, axis=2).min(axis=0)
     highest = np.abs(corners[:, :, 2]).max(axis=0)
     return bool(np.any(1.0001 * highest > nearest / np.sqrt(2)))
-
-
-def view_table(geometry: ConeBeamGeometry, grid: VolumeGrid) -> NDArray[np.float32]:
-    """Compose in float64 what geometry.clh calls a view, (views, 24).
-
-    Raises
-    ------
-    InputError
-        If a voxel, or the one beyond the last, is not in front of a source.
-    """
-    index_to_world = grid.index_to_world()
-    matrices = geometry.projection_matrices() @ index_to_world
-    ends = [(-1.0, float(n)) for n in grid.shape[::-1]]
-    corners = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(8, 3)
-    depth = (matrices[:, 2, :3] @ corners.T + matrices[:, 2, 3:]).min(axis=1)
-    if not depth.min() > 0:
-        raise InputError(
-            f"grid: it reaches behind the source of view {int(depth.argmin())}, expected every "
-            "voxel and the one beyond in front of every source"
-        )
-    corner = (
-        geometry.detector
-        - geometry.source
-        - 0.5 * (geometry.columns - 1) * geometry.u
-        - 0.5 * (geometry.rows - 1) * geometry.v
-    )
-    source = (geometry.source - index_to_world[:3, 3]) / grid.voxel_size
-    steps = [vector / grid.voxel_size for vector in (corner, geometry.u, geometry.v)]
-    if geometry.axial:
-        # Exactly, so that the rays of a column share their place in a plane to the last bit.
-        matrices[:, [0, 2], 2] = 0
-        steps[2][:, :2] = 0
-    table = np.concatenate([matrices.reshape(-1, 12), source, *steps], axis=1)
-    return np.ascontiguousarray(table, dtype=np.float32)

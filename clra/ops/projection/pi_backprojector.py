@@ -12,6 +12,7 @@ from clra.model.helix.helix import Helix
 from clra.model.helix.pi_intervals import pi_reach, pi_spans
 from clra.ops.projection.gpu_forms import size_constants
 from clra.ops.projection.layout import Layout
+from clra.ops.projection.view_table import ALIGNED
 from clra.ops.runtime.buffers import Allocator, to_device
 from clra.ops.runtime.kernel import Step
 
@@ -95,7 +96,7 @@ class PiBackProjector:
         columns = np.arange(own.shape[1] + 1)
         borders = np.sort(own.row(np.stack(own.window(own.tangent_u(columns)), axis=1)), axis=1)
         self._window = to_device(context, borders)
-        spans = [pi_spans(one, grid, radius) for one in helices]
+        spans = [pi_spans(one, grid.whole, radius) for one in helices]
         self._spans = to_device(context, np.stack(spans))
 
     def __call__(
@@ -142,6 +143,7 @@ class PiBackProjector:
             bottom, top = self._seen(start + first, start + last)
             if top <= bottom:
                 continue
+            bottom -= (layout.before + bottom) % ALIGNED
             part = projections[first:last]
             if layout.profile.on_cpu:
                 part, event = layout.gather_projections(queue, part, events)
@@ -167,6 +169,7 @@ class PiBackProjector:
                 last - first,
                 len(self._helices),
                 self._helix,
+                layout.grid.first,
                 bottom,
                 top,
                 *strip,

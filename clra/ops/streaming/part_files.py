@@ -212,6 +212,8 @@ class VolumeParts:
 class _FiledVolume(Volume):
     """A volume in files; as many of its slabs stay on the device as one slab may take of it."""
 
+    far = True
+
     def __init__(self, stream: Stream, parts: VolumeParts) -> None:
         self.grid = parts.grid
         self._stream, self._parts = stream, parts

@@ -1,6 +1,7 @@
 """Volumes that may lie in slabs: how they are filled, changed, projected and back-projected."""
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,7 @@ class SlabProjector:
     def __init__(self, stream: Stream, volume: Volume, geometry: ConeBeamGeometry) -> None:
         self._queue = stream.queue
         self._volume = volume
+        self._shape = geometry.shape
         scratch = Reused(stream.memory)
         slabs = volume.slabs
         self._seeing = [views_that_see(geometry, slab) for slab in slabs]
@@ -155,6 +157,36 @@ class SlabProjector:
         """
         return self._over_slabs((projections_out,), views)
 
+    def in_chunks(self, stream: Stream, chunks: Sequence[slice]) -> Iterator[tuple[slice, Array]]:
+        """Yield projections of all views of the geometry, a chunk of successive views at a time.
+
+        Parameters
+        ----------
+        stream : Stream
+            As before.
+        chunks : sequence of slice
+            Of the views, in order.
+
+        Yields
+        ------
+        views : slice
+            A chunk.
+        projections : cl.array.Array
+            float32 (n, rows, columns), which may be changed.
+        """
+        kept: Store | None = None
+        if self._volume.far and len(self._projectors) > 1 and len(chunks) > 1:
+            kept = Store((chunks[-1].stop, *self._shape), stream.room)
+            self.project_all(stream, kept)
+        for views in chunks:
+            part = stream.empty((views.stop - views.start, *self._shape))
+            if kept is None:
+                self(part, views)
+            else:
+                part.set(kept.read(views.start, views.stop), queue=self._queue)
+            yield views, part
+            del part  # before the next is made
+
     def project_all(self, stream: Stream, projections_out: Store) -> None:
         """Project all views of the geometry, slab by slab: of a volume in files each is read once.
 
@@ -168,6 +200,7 @@ class SlabProjector:
         shape = projections_out.shape[1:]
         begun = np.zeros(projections_out.shape[0], np.bool_)
         for index, seeing in enumerate(self._seeing):
+            slab = self._volume.get(index) if seeing.any() else None
             for run in runs(seeing):
                 for chunk in stream.chunks(run.stop - run.start, 4 * math.prod(shape)):
                     views = slice(run.start + chunk.start, run.start + chunk.stop)
@@ -175,7 +208,8 @@ class SlabProjector:
                     host[~begun[views]] = 0
                     part = stream.empty(host.shape)
                     part.set(host, queue=self._queue)
-                    self._project(index, (part,), views, accumulate=True)
+                    project = self._projectors[index]
+                    project(self._queue, part, slab, views=views, accumulate=True)
                     projections_out.write(views.start, stream.download(part))
                     begun[views] = True
         for view in np.flatnonzero(~begun).tolist():

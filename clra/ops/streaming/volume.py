@@ -56,7 +56,14 @@ class Volume(PlaneSource):
         Of the whole volume.
     volumes : int
         How many of its kind the device has to hold at a time.
+
+    Attributes
+    ----------
+    far : bool
+        Whether slabs that are not on the device come from files that others share.
     """
+
+    far = False
 
     def __init__(self, stream: Stream, grid: VolumeGrid, *, volumes: int = 1) -> None:
         self.grid = grid

@@ -75,6 +75,11 @@ def test_all_views_are_projected_with_each_slab_read_once(stream, tmp_path, monk
     monkeypatch.setattr(stream, "chunks", lambda views, size: equal_runs(views, -(-views // 5)))
     SlabProjector(stream, parts.volume(stream), geometry).project_all(stream, kept)
     assert read == [0, 1, 2]
+    read.clear()
+    project = SlabProjector(stream, parts.volume(stream), geometry)
+    for views, part in project.in_chunks(stream, equal_runs(24, 6)):
+        np.testing.assert_array_equal(stream.download(part), kept.read(views.start, views.stop))
+    assert read == [0, 1, 2] and views.stop == 24
     expected = stream.empty((24, 8, 16))
     SlabProjector(stream, volume_from(stream, grid, values), geometry)(expected, slice(0, 24))
     expected = stream.download(expected)
