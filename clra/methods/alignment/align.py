@@ -14,6 +14,7 @@ from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
 from clra.methods.alignment.rigid.held_out_errors import with_standard_errors
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
 from clra.methods.alignment.rigid.rigid_start import RigidStart
+from clra.methods.alignment.steps.odd_harmonics import are_open, with_odd_harmonics
 from clra.methods.assessment.assess import assess
 from clra.methods.assessment.radiograph_checks import refuse_counts
 from clra.methods.diagnostics import evidence
@@ -254,6 +255,9 @@ def align(
                     run.make_level = levels_by(executor, part)
                     run.align(stages, saved)
                     aligned = run.result()
+                    fit = solver.harmonics and not cancelled(findings)
+                    if fit and are_open(part, region, aligned):
+                        aligned = with_odd_harmonics(stream, part, region, aligned)
                     if estimate in FREE and not cancelled(findings):
                         rigid = RigidAlignment(
                             stream,

@@ -62,6 +62,9 @@ class Solver:
         the scan an arc of a parallel beam, whose slow modes they tell better than re-projections,
         see :func:`clra.methods.alignment.prealignment.prealignment.prealigned`; on other arcs with
         the column of the axis.
+    harmonics : bool
+        Of a truncated sample on a circle, fit the odd harmonics of the shifts along u in the end,
+        see :func:`clra.methods.alignment.steps.odd_harmonics.fitted_harmonics`.
     """
 
     estimator: str = "gauss-newton"
@@ -73,6 +76,7 @@ class Solver:
     shifts_first: bool = True
     spread: float = SPREAD
     prealign: bool = True
+    harmonics: bool = True
 
     def __post_init__(self) -> None:
         if self.estimator not in ESTIMATORS:
@@ -91,6 +95,7 @@ class Solver:
             shifts_first=False,
             spread=0.0,
             prealign=False,
+            harmonics=False,
         )
 
     def registration(

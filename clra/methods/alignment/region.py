@@ -17,9 +17,10 @@ from clra.ops.streaming.stream import Stream
 # Width of the grid of a truncated sample, in fields of view, by how far the sample seems to reach
 # beyond each side: least, growth with the square, most. What lies beside the field is in the
 # radiographs and has to be in the re-projections, but what is empty there fills with streaks. The
-# reach of samples with a thin rim is underestimated. Rock and balls of 1.0, 1.2, 1.5 and 2.0 fields
-# end in u at 0.08 to 0.05, 0.12 to 0.02, 0.2 and 0.4 to 0.2 pixel; with 1.6 for all at 0.10 to
-# 0.07, 0.18 to 0.02, 0.35 to 0.07 and the same, with 1.2 for all those of 2.0 at 1.
+# reach of samples with a thin rim is underestimated. Before odd harmonics are fitted, rock and
+# balls of 1.0, 1.2, 1.5 and 2.0 fields are in u at 0.08 to 0.05, 0.12 to 0.02, 0.2 and 0.4 to 0.2
+# pixel; with 1.6 for all at 0.10 to 0.07, 0.18 to 0.02, 0.35 to 0.07 and the same, with 1.2 for all
+# those of 2.0 at 1.
 _WIDTH, _GROWTH, _WIDEST = 1.15, 18.0, 1.6
 # Corrections of the volume of a truncated sample: 1 ended at 0.24 pixel, 2 at 0.18, 4 at 0.14; and
 # of an arc: of 200 degrees 1 at 0.035, 2 at 0.025, 3 at 0.017, of 140 degrees 1 at 0.09, 2 at 0.05,

@@ -14,9 +14,9 @@ Floats = NDArray[np.float64]
 # residual holds the reconstruction's errors as well; those displace a view, too, but less.
 _REGISTRATION, _REGISTRATION_M = 0.65, 0.5
 # Errors are so many times what held-out views find: the rest is in what all parts of the views
-# share. More of it along u where the sample is truncated, whose magnification in turn is predicted
-# worse than it was found, and on less than half a turn.
-_SEEN, _SEEN_OF_TRUNCATED, _SEEN_ON_TILTS = 1.1, (2.2, 1.6, 0.5), 1.6
+# share. More of it in shifts where the sample is truncated, and on less than half a turn. With 0.5
+# for the magnification, truncated rocks of 128 columns err by 1.4 to 2.8 times sigma.
+_SEEN, _SEEN_OF_TRUNCATED, _SEEN_ON_TILTS = 1.1, (1.8, 1.6, 1.0), 1.6
 # Views below which most of what is found is that they hardly predict each other.
 _MANY = 100
 # Views at each side over which squares of what is found are averaged.
