@@ -1,6 +1,7 @@
 """Find out how each radiograph moved: the choice of method, options and what they go with."""
 
 import os
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +27,7 @@ from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
 from clra.methods.shared_work.shared_level import levels_by
 from clra.methods.shared_work.shared_multigrid_level import multigrid_levels_by
 from clra.methods.shared_work.shared_rigid_level import rigid_levels_by
+from clra.methods.shared_work.shared_scan import reading_by
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -35,6 +37,7 @@ from clra.model.schedule import parse_schedule
 from clra.ops.runtime.devices import usable_devices
 from clra.ops.runtime.versions import versions
 from clra.ops.streaming.memory import DeviceMemoryError
+from clra.ops.streaming.radiographs import Reading
 from clra.ops.streaming.stream import Stream
 from clra.progress import ProgressCallback
 
@@ -192,7 +195,7 @@ def align(
 
     scale = estimate in ("shift+scale", "source", "shift+scale+roll")
     refuse_counts(scan)
-    with collected() as findings:
+    with collected() as findings, ExitStack() as work:
         scan = prepared(scan, corrections, progress=progress)
         # What the mask leaves of the detector is aligned as a detector of its own.
         part = scan.cropped()
@@ -220,23 +223,26 @@ def align(
             options = {"method": method, "schedule": schedule, "estimate": estimate}
             options |= {"gauge": gauge, "solver": repr(solver)}
             saved = keeping.begin(identity(part, grid, options, motion=start))
+        executor = work.enter_context(
+            executing(stream, devices, cluster, keeping, progress, limits)
+        )
+        reading = reading_by(executor, stream)
         try:
             if method == "imgr":
-                with executing(stream, devices, cluster, keeping, progress, limits) as executor:
-                    aligned = _by_imgr(
-                        stream,
-                        part,
-                        grid,
-                        levels=schedule,
-                        align=True,
-                        scale=scale,
-                        anchor=anchor,
-                        motion=start,
-                        truth=truth,
-                        checkpoint=keeping,
-                        saved=saved,
-                        make_level=multigrid_levels_by(executor, part),
-                    )
+                aligned = _by_imgr(
+                    stream,
+                    part,
+                    grid,
+                    levels=schedule,
+                    align=True,
+                    scale=scale,
+                    anchor=anchor,
+                    motion=start,
+                    truth=truth,
+                    checkpoint=keeping,
+                    saved=saved,
+                    make_level=multigrid_levels_by(executor, part),
+                )
             else:
                 region = region_of(stream, part, grid, own=own_grid)
                 run = CoarseToFine(
@@ -250,32 +256,31 @@ def align(
                     start,
                     truth,
                     keeping,
+                    levels_by(executor, part),
                 )
-                with executing(stream, devices, cluster, keeping, progress, limits) as executor:
-                    run.make_level = levels_by(executor, part)
-                    run.align(stages, saved)
-                    aligned = run.result()
-                    fit = solver.harmonics and not cancelled(findings)
-                    if fit and are_open(part, region, aligned):
-                        aligned = with_odd_harmonics(stream, part, region, aligned)
-                    if estimate in FREE and not cancelled(findings):
-                        rigid = RigidAlignment(
-                            stream,
-                            part,
-                            region,
-                            solver,
-                            estimate,
-                            aligned,
-                            anchor,
-                            keeping,
-                            run.state(),
-                            rigid_levels_by(executor, part),
-                        )
-                        aligned = rigid.align(saved)
+                run.align(stages, saved)
+                aligned = run.result()
+                fit = solver.harmonics and not cancelled(findings)
+                if fit and are_open(part, region, aligned):
+                    aligned = with_odd_harmonics(stream, part, region, aligned, reading)
+                if estimate in FREE and not cancelled(findings):
+                    rigid = RigidAlignment(
+                        stream,
+                        part,
+                        region,
+                        solver,
+                        estimate,
+                        aligned,
+                        anchor,
+                        keeping,
+                        run.state(),
+                        rigid_levels_by(executor, part),
+                    )
+                    aligned = rigid.align(saved)
         except AlignmentInterrupted as stopped:
             raise AlignmentInterrupted(told(stopped.result)) from None
         if quality and not cancelled(findings):
-            aligned, told_of = _judged(stream, part, aligned, start, scale)
+            aligned, told_of = _judged(stream, part, aligned, start, scale, reading)
             for finding in told_of:
                 finding.record()
         result = told(aligned)
@@ -285,12 +290,17 @@ def align(
 
 
 def _judged(
-    stream: Stream, scan: Scan, aligned: AlignmentResult, start: Motion, scale: bool
+    stream: Stream,
+    scan: Scan,
+    aligned: AlignmentResult,
+    start: Motion,
+    scale: bool,
+    reading: Reading,
 ) -> tuple[AlignmentResult, list[Finding]]:
     """Add a verdict and findings, unless the call is ended or there is not enough to judge by."""
     try:
         if aligned.valid_views.sum() >= _ENOUGH_TO_JUDGE:
-            judged = assess(stream, scan, aligned, start, scale=scale)
+            judged = assess(stream, scan, aligned, start, scale=scale, reading=reading)
             aligned = with_standard_errors(stream, scan, aligned, judged, scale=scale)
         return evidence(stream, scan, aligned)
     except (Cancelled, DeviceMemoryError):

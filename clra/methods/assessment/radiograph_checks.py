@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 
 # Views that are looked at, at most, and of these the ones of which every pixel is.
 _VIEWS, _CLOSELY = 48, 6
+# Pixels that the shorter side has in what is looked at coarsely, at least, and those, of the
+# detector's, that its brightest part is a mean of, along each side.
+_FINE, _SMOOTH = 512, 9
 # Transmission that only counts have; phase contrast and wrong flats stay below 3.
 _COUNTS = 10.0
 # Part of the largest line integral that may be left in the outermost columns. Scatter and an uneven
@@ -77,22 +80,33 @@ def radiograph_findings(scan: Scan) -> list[Finding]:
         Empty if all is well.
     """
     views = np.unique(np.linspace(0, scan.views - 1, _VIEWS).astype(int))
-    images = [scan.read(int(view), int(view) + 1)[0] for view in views]
-    spread = np.array([image.std() for image in images])
+    looks = np.array([_look(scan.read(int(view), int(view) + 1)[0]) for view in views])
+    spread = looks[:, 0]
     # A blank one, or one of something else, says nothing.
     odd = np.abs(np.log((spread + 1e-12) / np.median(spread + 1e-12))) > math.log(2)
-    images = [image for image, wrong in zip(images, odd, strict=True) if not wrong]
-    views = views[~odd]
-    if not images:
+    if odd.all():
         return []
-    # Means over some pixels: the brightest single ones are noise.
-    bright = np.array([np.quantile(uniform_filter(image, 9), 0.05) for image in images])
-    most = max(float(np.quantile(image, 0.999)) for image in images)
-    found = [_fading(bright, views), *_clipped(images[:: max(1, len(images) // _CLOSELY)])]
-    columns = np.array([_border(image[:, [0, -1]]) for image in images]) - bright[:, None]
+    views, (bright, largest, *borders) = views[~odd], looks[~odd, 1:].T
+    most = float(largest.max())
+    closely = views[:: max(1, len(views) // _CLOSELY)]
+    images = [scan.read(int(view), int(view) + 1)[0] for view in closely]
+    found = [_fading(bright, views), *_clipped(images)]
+    columns = np.stack(borders, axis=1) - bright[:, None]
     found.append(_truncation(columns, most, scan.geometry))
     found += [_axial(scan, most), _arc(scan.geometry), _few(scan.geometry)]
     return [finding for finding in found if finding is not None]
+
+
+def _look(image: NDArray[np.float32]) -> tuple[float, ...]:
+    """Spread of a radiograph, its brightest part, its largest value, and its left and right."""
+    step = max(1, min(image.shape) // _FINE)
+    rows, columns = (n // step for n in image.shape)
+    blocks = image[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    small = blocks.mean(axis=(1, 3))
+    # Means over some pixels: the brightest single ones are noise.
+    bright = np.quantile(uniform_filter(small, max(1, _SMOOTH // step)), 0.05)
+    left, right = _border(image[:, [0, -1]])
+    return float(image.std()), float(bright), float(np.quantile(small, 0.999)), left, right
 
 
 def _border(sides: NDArray[np.float32]) -> Floats:

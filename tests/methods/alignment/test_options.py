@@ -106,7 +106,7 @@ def test_the_circle_bounds_every_reconstruction(moved, monkeypatch, circle):
     class Watched(fbp.Coverage):
         def set_geometry(self, geometry):
             super().set_geometry(geometry)
-            radii.append(self._radius)
+            radii.append(self.radius)
 
     monkeypatch.setattr(fbp, "Coverage", Watched)
     _align(moved, "2QR", "shift", circle=circle)

@@ -33,7 +33,7 @@ from clra.model.sampling.field_of_view import is_offset
 from clra.model.scan import Scan
 from clra.model.subsets import ordered_subsets
 from clra.ops.streaming.memory import DeviceMemoryError
-from clra.ops.streaming.radiographs import Radiographs
+from clra.ops.streaming.radiographs import Reading, read_here
 from clra.ops.streaming.stream import Stream
 
 Floats = NDArray[np.float64]
@@ -85,7 +85,11 @@ def are_open(scan: Scan, region: Region, aligned: AlignmentResult) -> bool:
 
 
 def with_odd_harmonics(
-    stream: Stream, scan: Scan, region: Region, aligned: AlignmentResult
+    stream: Stream,
+    scan: Scan,
+    region: Region,
+    aligned: AlignmentResult,
+    reading: Reading | None = None,
 ) -> AlignmentResult:
     """Add the odd harmonics along u that re-projections do not find; none if the call is ended.
 
@@ -95,6 +99,8 @@ def with_odd_harmonics(
         As of :func:`fitted_harmonics`.
     aligned : AlignmentResult
         What re-projections found.
+    reading : callable, optional
+        Reads radiographs; this process by default.
 
     Raises
     ------
@@ -102,7 +108,7 @@ def with_odd_harmonics(
         With what re-projections found.
     """
     try:
-        more = fitted_harmonics(stream, scan, region, aligned.motion, aligned.valid_views)
+        more = fitted_harmonics(stream, scan, region, aligned.motion, aligned.valid_views, reading)
     except KeyboardInterrupt:
         raise AlignmentInterrupted(aligned) from None
     except DeviceMemoryError:
@@ -115,7 +121,12 @@ def with_odd_harmonics(
 
 
 def fitted_harmonics(
-    stream: Stream, scan: Scan, region: Region, motion: Motion, valid_views: NDArray[np.bool_]
+    stream: Stream,
+    scan: Scan,
+    region: Region,
+    motion: Motion,
+    valid_views: NDArray[np.bool_],
+    reading: Reading | None = None,
 ) -> Floats:
     """Fit the odd harmonics of the shifts along u at a low resolution.
 
@@ -131,6 +142,8 @@ def fitted_harmonics(
         What re-projections found [pixel of the full-resolution detector].
     valid_views : ndarray of bool, (views,)
         Views to go by.
+    reading : callable, optional
+        Reads radiographs; this process by default.
 
     Returns
     -------
@@ -141,7 +154,7 @@ def fitted_harmonics(
     chosen = np.flatnonzero(valid_views)
     if len(chosen) > _VIEWS:
         chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _VIEWS).astype(int))]
-    fit = _Fit(stream, scan.subset(chosen), region)
+    fit = _Fit(stream, scan.subset(chosen), region, reading or read_here(stream))
     angle = np.arctan2(scan.geometry.source[:, 1], scan.geometry.source[:, 0])
     shapes = np.stack([wave(n * angle) for n in _HARMONICS for wave in (np.cos, np.sin)])
     here = motion.subset(chosen)
@@ -185,13 +198,13 @@ def _square(images: Images) -> float:
 class _Fit:
     """What volumes leave of a scan's radiographs at a low resolution."""
 
-    def __init__(self, stream: Stream, scan: Scan, region: Region) -> None:
+    def __init__(self, stream: Stream, scan: Scan, region: Region, reading: Reading) -> None:
         self.level, (rows, columns) = 1, scan.geometry.shape
         while columns > _COLUMNS * self.level and min(rows, columns) >= 32 * self.level:
             self.level *= 2
         self._stream, self._geometry = stream, scan.geometry
         self._grid = region.grid.binned(self.level) if self.level > 1 else region.grid
-        self._radiographs = Radiographs(stream, scan, self.level, keep=True)
+        self._radiographs = reading(scan, self.level)
         self._measured = self._radiographs.read(slice(0, scan.views))
         self._used = used_pixels(scan, self.level)
         self._band = band_of(self._used.shape)
