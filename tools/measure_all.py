@@ -37,6 +37,8 @@ COMMANDS = {
     "wood": "figure4_small.py --scale 16 -o FOLDER",
     "imgr": "imgr_small.py",
     "memory": "memory_peaks.py",
+    "cluster-equal": "cluster_equal.py",
+    "cluster-times": "cluster_times.py",
     "cluster": "cluster_table.py",
     "gpu": "check_gpu.py --only limits",
     "bench": "bench.py --peer rtk --long",
