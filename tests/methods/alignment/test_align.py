@@ -193,6 +193,7 @@ def test_progress_names_stage_and_counts(moved):
     volume = ["reconstructing", "simulating", "correcting"]  # with one Neumann term
     assert steps == [
         *("looking for defects", "reading radiographs, binned 4 x 4"),
+        "looking for blank radiographs",
         *(*volume, "registering"),
         *(*volume, "registering what is simulated"),  # because the images are small
     ]

@@ -7,7 +7,7 @@ import clra
 from clra.app.simulation import paper_like, sample, simulated_scan
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def client(tmp_path_factory):
     distributed = pytest.importorskip("distributed")
     folder = tmp_path_factory.mktemp("dask")
@@ -42,7 +42,7 @@ def scan_file(path, kind, views, size=64):
     return clra.read_scan(path)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def scans(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scans")
     # As few views a turn as Katsevich's method takes.
@@ -50,11 +50,11 @@ def scans(tmp_path_factory):
     return {kind: scan_file(folder / f"{kind}.nxs", kind, n) for kind, n in views.items()}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def small_scan(tmp_path_factory):
     return scan_file(tmp_path_factory.mktemp("scans") / "small.nxs", "helix", 96, size=40)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def few_views(tmp_path_factory):
     return scan_file(tmp_path_factory.mktemp("scans") / "few.nxs", "space-filling", 96)
