@@ -23,6 +23,10 @@ _COLUMN = 95
 # To count the views that see a voxel, and divide by them, costs as much as this many voxels more
 # for each voxel.
 _COVERAGE = 55
+# The statistics of a ray, in pixels that are registered; and the host's time for a byte of a volume
+# between file and device, beside the file system's [s]: of OSEM-TR, which reads and writes volumes
+# for few views.
+_STATISTICS, _HANDLING_S = 4, 8e-10
 # Iterations of a level after which "until converged" mostly ends.
 _UNTIL_CONVERGED = 2
 # Time of the projection's adjoint, by that of the projection: 1.10 at 128 columns, 1.12 at 192.
@@ -240,6 +244,8 @@ def _ordered_subsets(
     seen_rows = 4.0 * rows * geometry.columns
     updates = math.prod(grid.shape) * views_a_voxel(geometry, grid)
     read = images / 4 * _READ_S * workers.slowdown
+    read += _STATISTICS * pixels * geometry.views * speed.registering
+    handled = _HANDLING_S * workers.slowdown
     forward, adjoint = updates * speed.forward, _ADJOINT * updates * speed.forward
     back = updates * speed.back + rows * geometry.columns * speed.filtering
     back += pixels * seen * _READ_S * workers.slowdown
@@ -256,11 +262,17 @@ def _ordered_subsets(
             PlannedStep(
                 "comparing",
                 chunks,
-                part * (forward + read),
+                part * (forward + read) + fetched * handled,
                 part * images + fetched,
                 part * images,
             ),
-            PlannedStep("stepping", tasks, part * adjoint, part * seen_rows + 2 * volume, volume),
+            PlannedStep(
+                "stepping",
+                tasks,
+                part * adjoint + 3 * volume * handled,
+                part * seen_rows + 2 * volume,
+                volume,
+            ),
         ]
     return steps
 

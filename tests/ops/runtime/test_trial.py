@@ -78,7 +78,7 @@ trial.main(request)
 
 
 def forged(device, index, name, paired):
-    """Status and answer, or what it died of, of a trial on a PoCL whose compiler was given that CPU name."""
+    """Status and answer, or last words, of a trial on a PoCL whose compiler was given that name."""
     request = {"index": index, "identity": self_test.identity(device), "cpu": None, "rate": False}
     done = subprocess.run(
         [sys.executable, "-P", "-W", "ignore", "-c", _FORGED, json.dumps(request), name, paired],
