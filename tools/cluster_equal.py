@@ -43,6 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scale", type=int, default=4, help="of the paper's size")
     parser.add_argument("--workers", type=int, nargs="+", default=[2, 4])
+    parser.add_argument("--trajectories", nargs="+", default=["helix", "space-filling"])
     parser.add_argument("--only", nargs="+", default=list(WORK), choices=list(WORK))
     options = parser.parse_args()
     counts = [f"{count} workers" for count in options.workers]
@@ -51,7 +52,7 @@ def main() -> None:
     here = Path.cwd()
     with tempfile.TemporaryDirectory(dir=here, prefix="clra-equal-") as folder:
         os.chdir(folder)
-        for trajectory in ("helix", "space-filling"):
+        for trajectory in options.trajectories:
             geometry = geometry_of(trajectory, options.scale)
             truth = true_motion(geometry, "random", MAGNIFICATION, SEED)
             made = simulated_scan(geometry, SPHERES, truth, name=trajectory)
