@@ -1,21 +1,17 @@
 """Multigrid reconstruction as tasks: what a level does with chunks of views and with slabs."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pyopencl.array import Array
 
+from clra.methods.alignment.reprojection import reprojected
 from clra.methods.execution.executor import Held
 from clra.methods.reconstruction.residuals import RadiographComparison, residual_chunks
 from clra.methods.shared_work.tasks import Measured
 from clra.model.geometry import ConeBeamGeometry
-from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import cropped, prolongate, restrict
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
-from clra.ops.streaming.radiographs import Radiographs
-from clra.ops.streaming.slab_projector import SlabProjector
 from clra.ops.streaming.stream import Stream
 
 # The block that is averaged is eight times as large as what it gives.
@@ -99,29 +95,16 @@ class CompareWithVolume:
     def __call__(self, stream: Stream, views: slice) -> tuple[float, NDArray[np.float64] | None]:
         """Return what the comparison of some views does."""
         radiographs = self.measured.some(stream, views)
+        volume, geometry = self.volume.volume(stream), self.geometry.subset(views)
         with self.target.writing(views) as write:
             return self.compare(
                 stream,
                 self.scan.get(),
                 radiographs,
-                self._pairs(stream, radiographs, self.geometry.subset(views)),
+                reprojected(stream, radiographs, volume, geometry, "comparing"),
                 self.known[views],
                 lambda _, simulated: write(simulated),
             )
-
-    def _pairs(
-        self, stream: Stream, radiographs: Radiographs, geometry: ConeBeamGeometry
-    ) -> Iterator[tuple[slice, Array, Array]]:
-        """Yield measured and simulated radiographs, these made slab by slab of the volume."""
-        simulated = Store(radiographs.shape, stream.room)
-        SlabProjector(stream, self.volume.volume(stream), geometry).project_all(stream, simulated)
-        for chunk in stream.chunks(geometry.views, radiographs.view_bytes):
-            made = stream.empty((chunk.stop - chunk.start, *geometry.shape))
-            made.set(simulated.read(chunk.start, chunk.stop), queue=stream.queue)
-            measured = radiographs.on_device(stream, chunk)
-            yield chunk, measured, made
-            stream.queue.finish()
-            del measured, made
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid
 from clra.model.view_selection import rows_that_see, runs, views_that_see
 from clra.ops.statistics.poisson import RayStatistics
-from clra.ops.streaming.memory import Store
 from clra.ops.streaming.multigrid import add_to_slab
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 from clra.ops.streaming.slab_projector import SlabAdjoint, SlabProjector, constant_volume
@@ -149,17 +148,12 @@ class CompareViews:
     def __call__(self, stream: Stream, views: slice) -> float:
         """Compare views; return the mean deviance of their rays, times the number of views."""
         rays, geometry, statistics = self.subset.rays(stream, views)
-        simulated = Store((geometry.views, *geometry.shape), stream.room)
         project = SlabProjector(stream, self.volume.volume(stream), geometry)
-        project.project_all(stream, simulated)
-        del project
         update = self.subset.likelihood.get().options.update
         targets = [parts for parts in (self.numerator, self.denominator) if parts is not None]
         with ExitStack() as files:
             takers = [files.enter_context(parts.writing(views)) for parts in targets]
-            for run in rays.runs(0, geometry.views):
-                part = stream.empty((run.stop - run.start, *geometry.shape))
-                part.set(simulated.read(run.start, run.stop), queue=stream.queue)
+            for run, part in project.in_chunks(stream, rays.runs(0, geometry.views)):
                 made = rays.compared(part, run, update)
                 # the second is for nobody where the denominator is precomputed
                 for write, images in zip(takers, made, strict=False):
