@@ -77,6 +77,24 @@ class Stage:
         return f"{'' if self.iterations is None else self.iterations}{level_name(self.level)}"
 
 
+def coarse_level(shape: tuple[int, int], columns: int, least: int = 32) -> int:
+    """Return the binning factor of a detector of which no more than some columns are looked at.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    columns : int
+        That are left at most.
+    least : int
+        Rows and columns below which it is not halved any more.
+    """
+    level = 1
+    while shape[1] > columns * level and min(shape) >= least * level:
+        level *= 2
+    return level
+
+
 def level_name(level: int) -> str:
     """Return "FR", "HR", "QR", "ER" or "SR" for the binning factors 1, 2, 4, 8 and 16."""
     for name, factor in _LEVELS.items():

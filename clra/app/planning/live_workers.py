@@ -51,7 +51,7 @@ def live_workers(
         items = range(cluster.places)
         # The first time kernels are built, by one worker longer than by another.
         for _ in range(2):
-            found = cluster.map(Test(geometry), items, stage="testing the workers")
+            found = cluster.map(SpeedTest(geometry), items, stage="testing the workers")
         return Workers(
             cluster.places,
             _middle([speed for speed, _ in found]),
@@ -61,7 +61,7 @@ def live_workers(
 
 
 @dataclass(frozen=True)
-class Test:
+class SpeedTest:
     """Measures the speed of a worker's device, and what the worker gets of its core."""
 
     geometry: ConeBeamGeometry

@@ -8,12 +8,14 @@ from typing import Any
 from clra.errors import Cancelled, InputError
 from clra.findings import Finding, collected
 from clra.methods.alignment.coarse_to_fine import CoarseToFine
+from clra.methods.alignment.level import Level
 from clra.methods.alignment.options import Solver
 from clra.methods.alignment.reference_scan import align_to_reference
 from clra.methods.alignment.region import region_of
 from clra.methods.alignment.result import AlignmentInterrupted, AlignmentResult
 from clra.methods.alignment.rigid.held_out_errors import with_standard_errors
 from clra.methods.alignment.rigid.rigid_alignment import FREE, RigidAlignment
+from clra.methods.alignment.rigid.rigid_level import RigidLevel
 from clra.methods.alignment.rigid.rigid_start import RigidStart
 from clra.methods.alignment.steps.odd_harmonics import are_open, with_odd_harmonics
 from clra.methods.assessment.assess import assess
@@ -23,11 +25,12 @@ from clra.methods.execution.checkpoint import Checkpoint, cancelled, checkpoint_
 from clra.methods.execution.choice import check_for_cluster, executing
 from clra.methods.preparation import prepared, with_detector_of
 from clra.methods.reconstruction.imgr import imgr
+from clra.methods.reconstruction.imgr_level import MultigridLevel
 from clra.methods.reconstruction.imgr_state import ReconstructionInterrupted
-from clra.methods.shared_work.shared_level import levels_by
-from clra.methods.shared_work.shared_multigrid_level import multigrid_levels_by
-from clra.methods.shared_work.shared_rigid_level import rigid_levels_by
-from clra.methods.shared_work.shared_scan import reading_by
+from clra.methods.shared_work.shared_level import SharedLevel
+from clra.methods.shared_work.shared_multigrid_level import SharedMultigridLevel
+from clra.methods.shared_work.shared_rigid_level import SharedRigidLevel
+from clra.methods.shared_work.shared_scan import levels_by, reading_by
 from clra.model.corrections.correction_options import CorrectionOptions
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
@@ -241,7 +244,7 @@ def align(
                     truth=truth,
                     checkpoint=keeping,
                     saved=saved,
-                    make_level=multigrid_levels_by(executor, part),
+                    make_level=levels_by(executor, part, MultigridLevel, SharedMultigridLevel),
                 )
             else:
                 region = region_of(stream, part, grid, own=own_grid)
@@ -256,7 +259,7 @@ def align(
                     start,
                     truth,
                     keeping,
-                    levels_by(executor, part),
+                    levels_by(executor, part, Level, SharedLevel),
                 )
                 run.align(stages, saved)
                 aligned = run.result()
@@ -274,7 +277,7 @@ def align(
                         anchor,
                         keeping,
                         run.state(),
-                        rigid_levels_by(executor, part),
+                        levels_by(executor, part, RigidLevel, SharedRigidLevel),
                     )
                     aligned = rigid.align(saved)
         except AlignmentInterrupted as stopped:

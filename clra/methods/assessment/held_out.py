@@ -28,6 +28,7 @@ from clra.model.geometry import ConeBeamGeometry
 from clra.model.grid import VolumeGrid, default_grid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
+from clra.model.schedule import coarse_level
 from clra.model.subsets import ordered_subsets
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS, Registration
 from clra.ops.streaming.radiographs import Radiographs, Reading, read_here
@@ -119,11 +120,7 @@ class HeldOut:
     @property
     def level(self) -> int:
         """Binning factor."""
-        rows, columns = self.scan.geometry.shape
-        level = 1
-        while columns > _COLUMNS * level and min(rows, columns) >= 32 * level:
-            level *= 2
-        return level
+        return coarse_level(self.scan.geometry.shape, _COLUMNS)
 
     def chosen(self, valid_views: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Return the valid views that are looked at: all, or some evenly spread runs of two."""

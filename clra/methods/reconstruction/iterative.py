@@ -15,11 +15,12 @@ from clra.methods.alignment.result import AlignmentResult
 from clra.methods.execution.checkpoint import Checkpoint, Saved, identity
 from clra.methods.execution.executor import InProcess, WorkerGroup
 from clra.methods.reconstruction.imgr import imgr
+from clra.methods.reconstruction.imgr_level import MultigridLevel
 from clra.methods.reconstruction.imgr_state import ImgrStep
 from clra.methods.reconstruction.osem_tr import OrderedSubsets, osem_tr, start_volume
-from clra.methods.shared_work.shared_multigrid_level import multigrid_levels_by
+from clra.methods.shared_work.shared_multigrid_level import SharedMultigridLevel
 from clra.methods.shared_work.shared_ordered_subsets import shared_osem_tr, shared_start_volume
-from clra.methods.shared_work.shared_scan import SharedScan
+from clra.methods.shared_work.shared_scan import SharedScan, levels_by
 from clra.model.grid import VolumeGrid
 from clra.model.motion import Motion
 from clra.model.scan import Scan
@@ -142,7 +143,7 @@ def iterate(
             osem=options,
             checkpoint=checkpoint,
             saved=saved,
-            make_level=multigrid_levels_by(executor, request.scan),
+            make_level=levels_by(executor, request.scan, MultigridLevel, SharedMultigridLevel),
         )
         found.volume.write(target)
         return found.steps, found.alignment

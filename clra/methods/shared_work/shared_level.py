@@ -1,8 +1,6 @@
 """One resolution of an alignment, whose work is shared out to several workers."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +13,10 @@ from clra.methods.alignment.reprojection import (
     register,
     reprojected,
 )
-from clra.methods.execution.executor import Held, InProcess, WorkerGroup
+from clra.methods.execution.executor import Held
 from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan
 from clra.methods.shared_work.tasks import Measured
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.scan import Scan
 from clra.ops.registration.gauss_newton import ESTIMATE_FIELDS
 from clra.ops.streaming.part_files import VolumeParts
 from clra.ops.streaming.stream import Stream
@@ -109,18 +106,3 @@ class Register:
         for chunk, measured, simulated in pairs:
             table[chunk] = register(stream, estimator, measured, simulated, known[chunk])
         return table
-
-
-def levels_by(executor: InProcess | WorkerGroup, scan: Scan) -> Callable[..., Level]:
-    """Return what makes levels: of this process, or shared out to several workers.
-
-    Parameters
-    ----------
-    executor : InProcess or WorkerGroup
-        Who does the work.
-    scan : Scan
-        That the levels are of.
-    """
-    if isinstance(executor, InProcess):
-        return Level
-    return partial(SharedLevel, shared=SharedScan(executor, scan))

@@ -1,14 +1,12 @@
 """One resolution of a multigrid reconstruction, whose work is shared out to several workers."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clra.methods.execution.executor import InProcess, WorkerGroup
 from clra.methods.reconstruction.imgr_level import Bools, Floats, MultigridLevel
 from clra.methods.reconstruction.residuals import RadiographComparison
 from clra.methods.shared_work.multigrid_tasks import (
@@ -23,7 +21,6 @@ from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan, 
 from clra.methods.shared_work.tasks import ReconstructSlab
 from clra.methods.truncation import extension
 from clra.model.motion import Motion
-from clra.model.scan import Scan
 from clra.model.view_selection import sampled
 from clra.ops.streaming.part_files import RadiographParts, VolumeParts
 
@@ -146,20 +143,3 @@ class SharedMultigridLevel(MultigridLevel):
             part=None if title is None else (0, 1),
         )
         return self.shared.source(target)
-
-
-def multigrid_levels_by(
-    executor: InProcess | WorkerGroup, scan: Scan
-) -> Callable[..., MultigridLevel]:
-    """Return what makes levels: of this process, or shared out to several workers.
-
-    Parameters
-    ----------
-    executor : InProcess or WorkerGroup
-        Who does the work.
-    scan : Scan
-        That the levels are of.
-    """
-    if isinstance(executor, InProcess):
-        return MultigridLevel
-    return partial(SharedMultigridLevel, shared=SharedScan(executor, scan))

@@ -1,19 +1,16 @@
 """One resolution of a rigid alignment, whose work is shared out to several workers."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clra.methods.alignment.reprojection import used_pixels
 from clra.methods.alignment.rigid.rigid_level import RigidLevel, rigid_equations
-from clra.methods.execution.executor import Held, InProcess, WorkerGroup
+from clra.methods.execution.executor import Held
 from clra.methods.shared_work.shared_scan import SharedRadiographs, SharedScan
 from clra.methods.shared_work.tasks import Measured
 from clra.model.geometry import ConeBeamGeometry
-from clra.model.scan import Scan
 from clra.ops.streaming.part_files import VolumeParts
 from clra.ops.streaming.stream import Stream
 
@@ -93,18 +90,3 @@ class RigidEquations:
             self.free,
             "registering",
         )
-
-
-def rigid_levels_by(executor: InProcess | WorkerGroup, scan: Scan) -> Callable[..., RigidLevel]:
-    """Return what makes levels: of this process, or shared out to several workers.
-
-    Parameters
-    ----------
-    executor : InProcess or WorkerGroup
-        Who does the work.
-    scan : Scan
-        That the levels are of.
-    """
-    if isinstance(executor, InProcess):
-        return RigidLevel
-    return partial(SharedRigidLevel, shared=SharedScan(executor, scan))

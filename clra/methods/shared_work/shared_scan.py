@@ -3,8 +3,9 @@
 import math
 import shutil
 import weakref
-from functools import cached_property
-from typing import Any
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,8 @@ from clra.ops.streaming.part_files import RadiographParts, TableParts, VolumePar
 from clra.ops.streaming.radiographs import PerView, Radiographs, Reading, read_here
 from clra.ops.streaming.stream import Stream, equal_runs
 from clra.ops.streaming.volume import PlaneSource, PlaneWriter
+
+Kind = TypeVar("Kind")
 
 # Views of a task at most: what a worker that is killed loses, and what one keeps on its host.
 _MOST_VIEWS = 1024
@@ -247,6 +250,25 @@ class SharedVolume(PlaneSource):
         reconstruct_planes(
             self._workers, task, shape, target, stage="writing the volume", part=None
         )
+
+
+def levels_by(
+    executor: InProcess | WorkerGroup, scan: Scan, here: type[Kind], shared: Callable[..., Kind]
+) -> Callable[..., Kind]:
+    """Return what makes levels of a scan: here, or shared out to several workers.
+
+    Parameters
+    ----------
+    executor : InProcess or WorkerGroup
+        Who does the work.
+    scan : Scan
+        That the levels are of.
+    here, shared : type
+        Of a level; the latter takes a :class:`SharedScan` as `shared`.
+    """
+    if isinstance(executor, InProcess):
+        return here
+    return partial(shared, shared=SharedScan(executor, scan))
 
 
 def reading_by(executor: InProcess | WorkerGroup, stream: Stream) -> Reading:

@@ -97,7 +97,7 @@ class Radiographs:
 
         They have to stay as they are.
         """
-        if self._uploaded is None or not keeps(stream.budgets, self.shape):
+        if self._uploaded is None or not self.stay_on(stream):
             return stream.upload(self.read(views, rows))
         if self._resident is None:
             self._resident = stream.empty(self.shape)

@@ -31,6 +31,7 @@ from clra.model.motion import Motion
 from clra.model.sampling.angular_coverage import covered, is_circle
 from clra.model.sampling.field_of_view import is_offset
 from clra.model.scan import Scan
+from clra.model.schedule import coarse_level
 from clra.model.subsets import ordered_subsets
 from clra.ops.streaming.memory import DeviceMemoryError
 from clra.ops.streaming.radiographs import Reading, read_here
@@ -199,9 +200,7 @@ class _Fit:
     """What volumes leave of a scan's radiographs at a low resolution."""
 
     def __init__(self, stream: Stream, scan: Scan, region: Region, reading: Reading) -> None:
-        self.level, (rows, columns) = 1, scan.geometry.shape
-        while columns > _COLUMNS * self.level and min(rows, columns) >= 32 * self.level:
-            self.level *= 2
+        self.level = coarse_level(scan.geometry.shape, _COLUMNS)
         self._stream, self._geometry = stream, scan.geometry
         self._grid = region.grid.binned(self.level) if self.level > 1 else region.grid
         self._radiographs = reading(scan, self.level)
